@@ -1,0 +1,24 @@
+// The kernels of cpu/kernel/ compiled for one instruction set. Every header stands before the
+// pragma, so that no shared inline function is compiled for it.
+#include "kernel/headers.h"
+
+#if defined(SURFCONV_X86)
+
+#pragma GCC push_options
+#pragma GCC target("avx2,fma,f16c")
+
+#define SURFCONV_ISA avx2_isa
+#define SURFCONV_VECTOR_BYTES 32
+#define SURFCONV_GEMM_ROWS 6
+#include "kernel/all.inl"
+
+#pragma GCC pop_options
+
+namespace surfconv::cpu {
+
+extern const Kernels kernels_avx2;
+const Kernels kernels_avx2 = {"avx2", avx2_isa::forward, avx2_isa::backward};
+
+}  // namespace surfconv::cpu
+
+#endif

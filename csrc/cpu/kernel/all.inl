@@ -1,0 +1,22 @@
+// Re-included once per instruction set, see isa_*.cpp.
+namespace surfconv::cpu::SURFCONV_ISA {
+
+#include "vec.inl"
+#include "workspace.inl"
+#include "pixels.inl"
+#include "samples.inl"
+#include "tile.inl"
+#include "gemm.inl"
+#include "blocks.inl"
+#include "gather.inl"
+#include "scatter.inl"
+#include "forward.inl"
+#include "bands.inl"
+#include "backward.inl"
+#include "gradients.inl"
+
+}  // namespace surfconv::cpu::SURFCONV_ISA
+
+#undef SURFCONV_ISA
+#undef SURFCONV_VECTOR_BYTES
+#undef SURFCONV_GEMM_ROWS

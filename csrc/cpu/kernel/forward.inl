@@ -1,0 +1,184 @@
+// Forward: for each tile of output pixels the corners once, then for each block of taps and
+// channels a gathered matrix that stays in cache and its product with the packed weights.
+template <class T>
+class Forward {
+ public:
+  Forward(const Conv& conv, const ForwardTensors& tensors, const Executor& executor)
+      : conv_(conv),
+        tensors_(tensors),
+        executor_(executor),
+        plan_(conv),
+        images_(images_at_once(conv, plan_)),
+        blocks_(channel_blocks(plan_, kBlock)),
+        taps_(taps_at_once(plan_.taps, std::min(kBlock, to_quads(plan_.channels)))),
+        width_(plan_.depthwise ? plan_.multiplier * plan_.row : pad_width<T>(plan_.outputs)),
+        ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
+        input_(conv, plan_, tensors.input, images_),
+        guide_(conv, tensors.guide, images_),
+        unseen_(static_cast<size_t>(plan_.row + kLanes<T>), T(0)) {
+    pack_weights();
+  }
+
+  void run() {
+    const int64_t pixels = conv_.y.out * conv_.x.out, tiles = (pixels + kTile - 1) / kTile;
+    const int64_t tasks = images_ * tiles;
+    const int workers = workers_for(
+        executor_, tasks, images_ * pixels * plan_.taps * plan_.channels * conv_.out_channels);
+    const int64_t need = Tile<T>::need(conv_, taps_) +
+                         Workspace::need<T>(round_up(kTile, kRowPad) * ld_rows_) +
+                         Workspace::need<T>(kTile * plan_.groups * width_);
+    Workspace memory(workers * need);
+    std::vector<Scratch> scratch;
+    scratch.reserve(static_cast<size_t>(workers));
+    for (int i = 0; i < workers; ++i) {
+      scratch.push_back({Tile<T>(conv_, taps_, memory), memory.take<T>(kTile * ld_rows_),
+                         memory.take<T>(kTile * plan_.groups * width_)});
+    }
+    for (int64_t first = 0; first < conv_.batch; first += images_) {
+      const int64_t images = std::min(images_, conv_.batch - first);
+      input_.pack(conv_, plan_, tensors_.input, first, images, executor_);
+      guide_.pack(conv_, tensors_.guide, first, images);
+      run_tasks(executor_, images * tiles, workers, [&](int worker, int64_t task) {
+        const int64_t begin = task % tiles * kTile;
+        tile(scratch[static_cast<size_t>(worker)], first, first + task / tiles, begin,
+             static_cast<int>(std::min<int64_t>(kTile, pixels - begin)));
+      });
+    }
+  }
+
+ private:
+  static constexpr int64_t kBlock = 64;
+
+  struct Scratch {
+    Tile<T> tile;
+    T* rows;  // gathered matrix [kTile][ld_rows]
+    T* out;   // [kTile][groups * width]
+  };
+
+  // Where the packed weights of a block of taps and channels start.
+  T* packed(const ChannelBlock& block, int64_t first_tap, int64_t taps) {
+    const int64_t depth = to_quads(plan_.channels);
+    return weights_.get() +
+           (block.group * plan_.taps * depth + first_tap * depth + taps * block.first) * width_;
+  }
+
+  void pack_weights() {
+    const WeightReader<T> reader(tensors_.weight, conv_.x.kernel);
+    const int64_t depth = plan_.taps * plan_.row;
+    weights_.reset(new T[static_cast<size_t>(depth * (plan_.depthwise ? plan_.multiplier : width_))]);
+    initial_.assign(static_cast<size_t>(plan_.groups * width_), T(0));
+    const int64_t stride = plan_.depthwise ? plan_.row : width_;
+    if (tensors_.bias.data != nullptr) {
+      visit_storage<T>(tensors_.bias, [&](auto* bias) {
+        for (int64_t o = 0; o < conv_.out_channels; ++o) {
+          const int64_t place = plan_.depthwise
+                                    ? o % plan_.multiplier * stride + o / plan_.multiplier
+                                    : o / plan_.outputs * stride + o % plan_.outputs;
+          initial_[static_cast<size_t>(place)] = widen(bias[o * tensors_.bias.c]);
+        }
+      });
+    }
+    if (plan_.depthwise) return pack_depthwise(reader, plan_, weights_.get());
+    const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
+    const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
+    run_tasks(executor_, tasks, workers_for(executor_, tasks, depth * width_),
+              [&](int, int64_t task) {
+                const ChannelBlock& block = blocks_[static_cast<size_t>(task / tap_blocks)];
+                const int64_t first_tap = task % tap_blocks * taps_;
+                const int64_t taps = std::min(taps_, plan_.taps - first_tap);
+                pack_forward(reader, plan_, block, first_tap, taps, packed(block, first_tap, taps));
+              });
+  }
+
+  void tile(Scratch& scratch, int64_t first_image, int64_t n, int64_t begin, int count) {
+    constexpr int64_t bytes = sizeof(T);
+    const T* image = input_.image(conv_, plan_, tensors_.input, first_image, n);
+    const char* base = reinterpret_cast<const char*>(image);
+    const int64_t unseen = byte_distance(base, unseen_.data());
+    const AxisSteps steps_y{input_.step_y(conv_, plan_, tensors_.input) * bytes, 0, conv_.x.in};
+    const AxisSteps steps_x{input_.step_x(plan_, tensors_.input) * bytes, 0, 1};
+    scratch.tile.place(tensors_.scale, guide_.image(conv_, tensors_.guide, first_image, n), n,
+                       begin, count, steps_y, steps_x);
+    const int64_t ld_out = plan_.groups * width_;
+    if (plan_.depthwise) {
+      for (int m = 0; m < count; ++m) {
+        std::memcpy(scratch.out + m * ld_out, initial_.data(), static_cast<size_t>(ld_out * bytes));
+      }
+    }
+    for (int64_t first_tap = 0; first_tap < plan_.taps; first_tap += taps_) {
+      const int64_t taps = std::min(taps_, plan_.taps - first_tap);
+      scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
+      for (const ChannelBlock& block : blocks_) {
+        const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
+        for (int64_t t = 0; t < taps; ++t) {
+          gather_tap(scratch.tile.tap(t), base + channel * bytes, count, block.padded,
+                     scratch.rows + t * block.padded, ld_rows_);
+        }
+        if (plan_.depthwise) {
+          multiply_depthwise(scratch, block, first_tap, taps, count);
+        } else {
+          const bool first = first_tap == 0 && block.first == 0;
+          gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded,
+                         scratch.rows, ld_rows_, packed(block, first_tap, taps),
+                         scratch.out + block.group * width_, ld_out,
+                         first ? initial_.data() + block.group * width_ : nullptr);
+        }
+      }
+    }
+    if (plan_.depthwise) {
+      View output = tensors_.output;
+      output.c *= plan_.multiplier;
+      for (int64_t j = 0; j < plan_.multiplier; ++j) {
+        View plane = output;
+        advance(plane, j * tensors_.output.c);
+        store_pixels<T>(plane, n, 0, plan_.channels, conv_.x.out, begin, count,
+                        scratch.out + j * plan_.row, ld_out);
+      }
+    } else {
+      for (int64_t g = 0; g < plan_.groups; ++g) {
+        store_pixels<T>(tensors_.output, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin,
+                        count, scratch.out + g * width_, ld_out);
+      }
+    }
+  }
+
+  void multiply_depthwise(Scratch& scratch, const ChannelBlock& block, int64_t first_tap,
+                          int64_t taps, int count) {
+    const int64_t ld_out = plan_.groups * width_;
+    for (int m = 0; m < count; ++m) {
+      for (int64_t t = 0; t < taps; ++t) {
+        const T* row = scratch.rows + m * ld_rows_ + t * block.padded;
+        for (int64_t j = 0; j < plan_.multiplier; ++j) {
+          const T* weight = weights_.get() +
+                            ((first_tap + t) * plan_.multiplier + j) * plan_.row + block.first;
+          T* out = scratch.out + m * ld_out + j * plan_.row + block.first;
+          for_channels<T>(block.padded, [&](int64_t c, auto lanes) {
+            using V = Vec<T, decltype(lanes)::lanes>;
+            store(out + c, V(load<V>(out + c) + load<V>(row + c) * load<V>(weight + c)));
+          });
+        }
+      }
+    }
+  }
+
+  const Conv& conv_;
+  const ForwardTensors& tensors_;
+  const Executor& executor_;
+  const Plan plan_;
+  const int64_t images_;
+  const std::vector<ChannelBlock> blocks_;
+  const int64_t taps_, width_, ld_rows_;
+  InputRows<T> input_;
+  GuideRows<T> guide_;
+  std::vector<T> unseen_;  // what a corner outside the image reads
+  std::vector<T> initial_;
+  std::unique_ptr<T[]> weights_;
+};
+
+void forward(const Conv& conv, const ForwardTensors& tensors, const Executor& executor) {
+  if (tensors.input.dtype == DType::f64) {
+    Forward<double>(conv, tensors, executor).run();
+  } else {
+    Forward<float>(conv, tensors, executor).run();
+  }
+}

@@ -1,0 +1,252 @@
+// Moves runs of pixels between tensors of any strides and dtype and channel-innermost buffers of
+// the compute type.
+struct BFloat16 {
+  uint16_t bits;
+};
+struct Float16 {
+  uint16_t bits;
+};
+
+SURFCONV_INLINE uint32_t bits_of(float value) {
+  uint32_t bits;
+  __builtin_memcpy(&bits, &value, 4);
+  return bits;
+}
+SURFCONV_INLINE float float_of(uint32_t bits) {
+  float value;
+  __builtin_memcpy(&value, &bits, 4);
+  return value;
+}
+
+SURFCONV_INLINE float widen(float value) { return value; }
+SURFCONV_INLINE double widen(double value) { return value; }
+SURFCONV_INLINE float widen(BFloat16 value) { return float_of(uint32_t{value.bits} << 16); }
+SURFCONV_INLINE float widen(Float16 value) {
+  const uint32_t magnitude = value.bits & 0x7fffu;
+  const float finite = float_of(magnitude << 13) * float_of(0x77800000u);  // 2^112 rebiases
+  const uint32_t special = magnitude >= 0x7c00u ? 0x7f800000u : 0u;
+  return float_of(bits_of(finite) | special | (uint32_t{value.bits} & 0x8000u) << 16);
+}
+
+SURFCONV_INLINE void narrow(float value, float* to) { *to = value; }
+SURFCONV_INLINE void narrow(double value, double* to) { *to = value; }
+SURFCONV_INLINE void narrow(double value, float* to) { *to = static_cast<float>(value); }
+SURFCONV_INLINE void narrow(float value, BFloat16* to) {
+  const uint32_t u = bits_of(value);
+  const uint32_t rounded = (u + 0x7fffu + ((u >> 16) & 1u)) >> 16;
+  const bool nan = (u & 0x7fffffffu) > 0x7f800000u;
+  to->bits = static_cast<uint16_t>(nan ? 0x7fc0u : rounded);
+}
+SURFCONV_INLINE void narrow(float value, Float16* to) {
+  const uint32_t sign = bits_of(value) & 0x80000000u;
+  const uint32_t u = bits_of(value) ^ sign;
+  const uint32_t special = u > 0x7f800000u ? 0x7e00u : 0x7c00u;
+  // Adding 0.5 lets the adder round a subnormal result in the last bits of the sum.
+  const uint32_t small = bits_of(float_of(u) + 0.5f) - 0x3f000000u;
+  const uint32_t normal = (u + 0xc8000fffu + ((u >> 13) & 1u)) >> 13;
+  const uint32_t magnitude = u >= 0x47800000u ? special : (u < 0x38800000u ? small : normal);
+  to->bits = static_cast<uint16_t>(magnitude | sign >> 16);
+}
+
+// body(pointer of the storage type); float16 types never meet double arithmetic.
+template <class T, class Body>
+SURFCONV_INLINE void visit_storage(const View& view, const Body& body) {
+  switch (view.dtype) {
+    case DType::f32:
+      return body(static_cast<float*>(view.data));
+    case DType::f64:
+      if constexpr (sizeof(T) == 8) return body(static_cast<double*>(view.data));
+      break;
+    case DType::bf16:
+      if constexpr (sizeof(T) == 4) return body(static_cast<BFloat16*>(view.data));
+      break;
+    case DType::f16:
+      if constexpr (sizeof(T) == 4) return body(static_cast<Float16*>(view.data));
+      break;
+  }
+}
+
+#if defined(__clang__)
+#define SURFCONV_SHUFFLE(T, N, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define SURFCONV_SHUFFLE(T, N, a, b, ...) \
+  __builtin_shuffle(a, b, Vec<std::conditional_t<sizeof(T) == 8, int64_t, int32_t>, N>{__VA_ARGS__})
+#endif
+
+template <class T>
+SURFCONV_INLINE void transpose_4x4(const T* from, int64_t from_row, T* to, int64_t to_row) {
+  using V = Vec<T, 4>;
+  const V a = load<V>(from), b = load<V>(from + from_row);
+  const V c = load<V>(from + 2 * from_row), d = load<V>(from + 3 * from_row);
+  const V ab_lo = SURFCONV_SHUFFLE(T, 4, a, b, 0, 4, 1, 5);
+  const V ab_hi = SURFCONV_SHUFFLE(T, 4, a, b, 2, 6, 3, 7);
+  const V cd_lo = SURFCONV_SHUFFLE(T, 4, c, d, 0, 4, 1, 5);
+  const V cd_hi = SURFCONV_SHUFFLE(T, 4, c, d, 2, 6, 3, 7);
+  store(to, SURFCONV_SHUFFLE(T, 4, ab_lo, cd_lo, 0, 1, 4, 5));
+  store(to + to_row, SURFCONV_SHUFFLE(T, 4, ab_lo, cd_lo, 2, 3, 6, 7));
+  store(to + 2 * to_row, SURFCONV_SHUFFLE(T, 4, ab_hi, cd_hi, 0, 1, 4, 5));
+  store(to + 3 * to_row, SURFCONV_SHUFFLE(T, 4, ab_hi, cd_hi, 2, 3, 6, 7));
+}
+
+SURFCONV_INLINE void transpose_8x8(const float* from, int64_t from_row, float* to,
+                                   int64_t to_row) {
+  using V = Vec<float, 8>;
+  V r[8], s[8];
+#pragma GCC unroll 8
+  for (int i = 0; i < 8; ++i) r[i] = load<V>(from + i * from_row);
+#pragma GCC unroll 4
+  for (int i = 0; i < 8; i += 2) {
+    s[i] = SURFCONV_SHUFFLE(float, 8, r[i], r[i + 1], 0, 8, 1, 9, 4, 12, 5, 13);
+    s[i + 1] = SURFCONV_SHUFFLE(float, 8, r[i], r[i + 1], 2, 10, 3, 11, 6, 14, 7, 15);
+  }
+#pragma GCC unroll 2
+  for (int i = 0; i < 8; i += 4) {
+    r[i] = SURFCONV_SHUFFLE(float, 8, s[i], s[i + 2], 0, 1, 8, 9, 4, 5, 12, 13);
+    r[i + 1] = SURFCONV_SHUFFLE(float, 8, s[i], s[i + 2], 2, 3, 10, 11, 6, 7, 14, 15);
+    r[i + 2] = SURFCONV_SHUFFLE(float, 8, s[i + 1], s[i + 3], 0, 1, 8, 9, 4, 5, 12, 13);
+    r[i + 3] = SURFCONV_SHUFFLE(float, 8, s[i + 1], s[i + 3], 2, 3, 10, 11, 6, 7, 14, 15);
+  }
+#pragma GCC unroll 4
+  for (int i = 0; i < 4; ++i) {
+    store(to + i * to_row, SURFCONV_SHUFFLE(float, 8, r[i], r[i + 4], 0, 1, 2, 3, 8, 9, 10, 11));
+    store(to + (i + 4) * to_row,
+          SURFCONV_SHUFFLE(float, 8, r[i], r[i + 4], 4, 5, 6, 7, 12, 13, 14, 15));
+  }
+}
+
+// to[column * to_row + row] = from[row * from_row + column]
+template <class T>
+void transpose(const T* from, int64_t from_row, int64_t rows, int64_t columns, T* to,
+               int64_t to_row) {
+  constexpr int64_t step = sizeof(T) == 4 && kLanes<T> >= 8 ? 8 : 4;
+  int64_t column = 0;
+  for (; column + step <= columns; column += step) {
+    int64_t row = 0;
+    for (; row + step <= rows; row += step) {
+      const T* block = from + row * from_row + column;
+      if constexpr (step == 8) {
+        transpose_8x8(block, from_row, to + column * to_row + row, to_row);
+      } else {
+        transpose_4x4(block, from_row, to + column * to_row + row, to_row);
+      }
+    }
+    for (; row < rows; ++row) {
+      for (int64_t i = column; i < column + step; ++i) {
+        to[i * to_row + row] = from[row * from_row + i];
+      }
+    }
+  }
+  for (; column < columns; ++column) {
+    for (int64_t row = 0; row < rows; ++row) to[column * to_row + row] = from[row * from_row + column];
+  }
+}
+
+// Flat pixels first .. first+count-1 of an image as runs of constant stride.
+// body(pixels already done, pixels of the run, element offset of its first)
+template <class Body>
+SURFCONV_INLINE void for_runs(const View& view, int64_t width, int64_t first, int64_t count,
+                              const Body& body) {
+  if (view.y == view.x * width) return body(0, count, first * view.x);
+  for (int64_t done = 0; done < count;) {
+    const int64_t y = (first + done) / width, x = (first + done) % width;
+    const int64_t run = std::min(count - done, width - x);
+    body(done, run, y * view.y + x * view.x);
+    done += run;
+  }
+}
+
+constexpr int64_t kStage = 64;  // pixels converted at a time between half types and transposes
+
+// to[pixel * ld + channel]; channels up to `padded` become zero.
+template <class T>
+void load_pixels(const View& view, int64_t n, int64_t first_channel, int64_t channels,
+                 int64_t width, int64_t first, int64_t count, T* to, int64_t ld, int64_t padded) {
+  visit_storage<T>(view, [&](auto* data) {
+    using S = std::remove_pointer_t<decltype(data)>;
+    const S* origin = data + n * view.n + first_channel * view.c;
+    for_runs(view, width, first, count, [&](int64_t done, int64_t run, int64_t offset) {
+      const S* from = origin + offset;
+      T* rows = to + done * ld;
+      if (view.c != 1 && view.x == 1) {
+        if constexpr (std::is_same_v<S, T>) {
+          transpose(from, view.c, channels, run, rows, ld);
+        } else {
+          T stage[8 * kStage];
+          for (int64_t p = 0; p < run; p += kStage) {
+            const int64_t pixels = std::min(kStage, run - p);
+            for (int64_t c = 0; c < channels; c += 8) {
+              const int64_t planes = std::min<int64_t>(8, channels - c);
+              for (int64_t i = 0; i < planes; ++i) {
+                const S* plane = from + (c + i) * view.c + p;
+                for (int64_t j = 0; j < pixels; ++j) stage[i * kStage + j] = widen(plane[j]);
+              }
+              transpose(stage, kStage, planes, pixels, rows + p * ld + c, ld);
+            }
+          }
+        }
+      } else if (view.c == 1) {
+        for (int64_t p = 0; p < run; ++p) {
+          const S* pixel = from + p * view.x;
+          T* row = rows + p * ld;
+          for (int64_t c = 0; c < channels; ++c) row[c] = widen(pixel[c]);
+        }
+      } else {
+        for (int64_t p = 0; p < run; ++p) {
+          const S* pixel = from + p * view.x;
+          for (int64_t c = 0; c < channels; ++c) rows[p * ld + c] = widen(pixel[c * view.c]);
+        }
+      }
+    });
+  });
+  if (padded > channels) {
+    for (int64_t p = 0; p < count; ++p) {
+      for (int64_t c = channels; c < padded; ++c) to[p * ld + c] = 0;
+    }
+  }
+}
+
+template <class T>
+void store_pixels(const View& view, int64_t n, int64_t first_channel, int64_t channels,
+                  int64_t width, int64_t first, int64_t count, const T* from, int64_t ld) {
+  visit_storage<T>(view, [&](auto* data) {
+    using S = std::remove_pointer_t<decltype(data)>;
+    S* origin = data + n * view.n + first_channel * view.c;
+    for_runs(view, width, first, count, [&](int64_t done, int64_t run, int64_t offset) {
+      S* to = origin + offset;
+      const T* rows = from + done * ld;
+      if (view.c != 1 && view.x == 1) {
+        if constexpr (std::is_same_v<S, T>) {
+          transpose(rows, ld, run, channels, to, view.c);
+        } else {
+          T stage[8 * kStage];
+          for (int64_t p = 0; p < run; p += kStage) {
+            const int64_t pixels = std::min(kStage, run - p);
+            for (int64_t c = 0; c < channels; c += 8) {
+              const int64_t planes = std::min<int64_t>(8, channels - c);
+              transpose(rows + p * ld + c, ld, pixels, planes, stage, kStage);
+              for (int64_t i = 0; i < planes; ++i) {
+                S* plane = to + (c + i) * view.c + p;
+                for (int64_t j = 0; j < pixels; ++j) narrow(stage[i * kStage + j], plane + j);
+              }
+            }
+          }
+        }
+      } else {
+        for (int64_t p = 0; p < run; ++p) {
+          S* pixel = to + p * view.x;
+          const T* row = rows + p * ld;
+          if (view.c == 1) {
+            for (int64_t c = 0; c < channels; ++c) narrow(row[c], pixel + c);
+          } else {
+            for (int64_t c = 0; c < channels; ++c) narrow(row[c], pixel + c * view.c);
+          }
+        }
+      }
+    });
+  });
+}
+
+inline void advance(View& view, int64_t elements) {
+  const int64_t sizes[] = {4, 8, 2, 2};
+  view.data = static_cast<char*>(view.data) + elements * sizes[static_cast<int>(view.dtype)];
+}

@@ -1,0 +1,203 @@
+// Where the taps of one tile of output pixels fall, and what each corner weighs.
+constexpr int kTile = 48;
+
+// Per axis, tap and side (pixel `lo`, then `lo + 1`), one entry for each pixel of the tile.
+template <class T>
+struct AxisTable {
+  T* weight;       // 0 outside the image
+  T* inside;       // 1 inside the image, else 0
+  int64_t* read;   // byte offset in the input
+  int64_t* write;  // byte offset in the gradient of the input
+  int64_t* pixel;  // this axis' share of the flat pixel number
+
+  static int64_t entries(const Axis& axis) { return axis.kernel * 2 * kTile; }
+  static int64_t need(const Axis& axis) {
+    return 2 * Workspace::need<T>(entries(axis)) + 3 * Workspace::need<int64_t>(entries(axis));
+  }
+  void take(const Axis& axis, Workspace& memory) {
+    weight = memory.take<T>(entries(axis));
+    inside = memory.take<T>(entries(axis));
+    read = memory.take<int64_t>(entries(axis));
+    write = memory.take<int64_t>(entries(axis));
+    pixel = memory.take<int64_t>(entries(axis));
+  }
+};
+
+// Byte steps of an axis. Rows of the gradient may lie apart: then write_rows lists them.
+struct AxisSteps {
+  int64_t read = 0, write = 0, pixel = 0;
+  const int64_t* write_rows = nullptr;
+};
+
+template <class T, class Int>
+void fill_axis(const Axis& axis, const AxisSteps& steps, int count, const T* __restrict scale,
+               const int64_t* __restrict centre, const AxisTable<T>& table) {
+  const T half = axis.centre_is_half() ? T(0.5) : T(0);
+  const T limit = static_cast<T>(int64_t{1} << (sizeof(Int) == 4 ? 29 : 61));
+  const Int size = static_cast<Int>(axis.in);
+  for (int64_t t = 0; t < axis.kernel; ++t) {
+    const T tap = static_cast<T>(axis.tap_doubled(t)) / 2;
+    const int64_t at = t * 2 * kTile;
+    Int lo[kTile];
+    T* __restrict weight = table.weight + at;
+    T* __restrict inside = table.inside + at;
+    if (axis.fixed(t)) {
+      for (int m = 0; m < count; ++m) {
+        const bool in = (centre[m] >= 0) & (centre[m] < axis.in);
+        lo[m] = in ? static_cast<Int>(centre[m]) : 0;
+        weight[m] = inside[m] = in ? T(1) : T(0);
+      }
+    } else {
+      for (int m = 0; m < count; ++m) {
+        const auto position = locate<T, Int>(static_cast<Int>(centre[m]), half, tap, scale[m], limit);
+        const bool in_lo = position.reachable & (position.lo >= 0) & (position.lo < size);
+        const bool in_hi = position.reachable & (position.lo >= -1) & (position.lo < size - 1);
+        lo[m] = position.lo;
+        inside[m] = in_lo ? T(1) : T(0);
+        inside[kTile + m] = in_hi ? T(1) : T(0);
+        weight[m] = in_lo ? 1 - position.fraction : T(0);
+        weight[kTile + m] = in_hi ? position.fraction : T(0);
+      }
+    }
+    const int sides = axis.fixed(t) ? 1 : 2;
+    for (int side = 0; side < sides; ++side) {
+      int64_t* __restrict read = table.read + at + side * kTile;
+      int64_t* __restrict pixel = table.pixel + at + side * kTile;
+      for (int m = 0; m < count; ++m) {
+        const int64_t index = static_cast<int64_t>(lo[m]) + side;
+        read[m] = index * steps.read;
+        pixel[m] = index * steps.pixel;
+      }
+      int64_t* __restrict write = table.write + at + side * kTile;
+      if (steps.write_rows != nullptr) {
+        for (int m = 0; m < count; ++m) {
+          const bool in = inside[side * kTile + m] != 0;
+          write[m] = in ? steps.write_rows[static_cast<int64_t>(lo[m]) + side] : 0;
+        }
+      } else if (steps.write != 0) {
+        for (int m = 0; m < count; ++m) write[m] = (static_cast<int64_t>(lo[m]) + side) * steps.write;
+      }
+    }
+  }
+}
+
+// The guide around a tile: what each corner's value is compared with.
+template <class T>
+struct GuideTile {
+  const T* image = nullptr;  // the whole image's guide, pixel by pixel; null: no guide
+  T tolerance = 0;
+  T centre[kTile];  // not finite: the guide does not apply
+};
+
+// Corners of one tap: 1, 2 or 4 of them, [corner][kTile]. A corner of zero weight is never seen:
+// its offsets point to a row of zeros and to a row that nobody reads.
+template <class T>
+struct TapCorners {
+  int corners;
+  bool kink;  // some corner of zero weight still counts for the derivative
+  T* weight;
+  int64_t* read;
+  int64_t* write;
+  T* slope;    // d(sample)/d(scale), or of scale_y where there are two components
+  T* slope_x;  // of scale_x
+};
+
+template <class T>
+struct CornerTable {
+  T* weight;
+  T* slope;
+  int64_t* read;
+  int64_t* write;
+  std::vector<TapCorners<T>> taps;
+
+  static int64_t entries(int64_t taps) { return taps * 4 * kTile; }
+  static int64_t need(int64_t taps) {
+    return 3 * Workspace::need<T>(entries(taps)) + 2 * Workspace::need<int64_t>(entries(taps));
+  }
+  void take(int64_t count, Workspace& memory) {
+    weight = memory.take<T>(entries(count));
+    slope = memory.take<T>(2 * entries(count));
+    read = memory.take<int64_t>(entries(count));
+    write = memory.take<int64_t>(entries(count));
+    taps.resize(static_cast<size_t>(count));
+    for (int64_t t = 0; t < count; ++t) {
+      taps[t] = {4, false, weight + t * 4 * kTile, read + t * 4 * kTile, write + t * 4 * kTile,
+                 slope + t * 8 * kTile, slope + t * 8 * kTile + 4 * kTile};
+    }
+  }
+};
+
+enum class Slopes { none, one, two };
+
+// ty, tx: the tap's place in the kernel; unseen_read, unseen_write: where unseen corners point.
+template <class T, bool Guided, bool Writes, Slopes S>
+void fill_corners(const Conv& conv, int64_t ty, int64_t tx, int count, const AxisTable<T>& rows,
+                  const AxisTable<T>& columns, const GuideTile<T>& guide, int64_t unseen_read,
+                  int64_t unseen_write, TapCorners<T>& tap) {
+  const int sides_y = conv.y.fixed(ty) ? 1 : 2, sides_x = conv.x.fixed(tx) ? 1 : 2;
+  const T tap_y = static_cast<T>(conv.y.tap_doubled(ty)) / 2;
+  const T tap_x = static_cast<T>(conv.x.tap_doubled(tx)) / 2;
+  tap.corners = sides_y * sides_x;
+  int kinks = 0;
+  for (int i = 0; i < sides_y; ++i) {
+    for (int j = 0; j < sides_x; ++j) {
+      const int64_t at_y = (ty * 2 + i) * kTile, at_x = (tx * 2 + j) * kTile;
+      const int64_t corner = (i * sides_x + j) * kTile;
+      const T* __restrict weight_y = rows.weight + at_y;
+      const T* __restrict weight_x = columns.weight + at_x;
+      const T* __restrict inside_y = rows.inside + at_y;
+      const T* __restrict inside_x = columns.inside + at_x;
+      T* __restrict weight = tap.weight + corner;
+      T visible[kTile];
+      if constexpr (Guided) {
+        const int64_t* __restrict pixel_y = rows.pixel + at_y;
+        const int64_t* __restrict pixel_x = columns.pixel + at_x;
+        for (int m = 0; m < count; ++m) {
+          const bool in = (inside_y[m] != 0) & (inside_x[m] != 0);
+          const T value = guide.image[in ? pixel_y[m] + pixel_x[m] : 0];
+          const T centre = guide.centre[m];
+          const bool applies = centre - centre == 0;
+          visible[m] = !applies | (std::fabs(value - centre) <= guide.tolerance) ? T(1) : T(0);
+        }
+      }
+      for (int m = 0; m < count; ++m) {
+        weight[m] = weight_y[m] * weight_x[m];
+        if constexpr (Guided) weight[m] *= visible[m];
+      }
+      const int64_t* __restrict read_y = rows.read + at_y;
+      const int64_t* __restrict read_x = columns.read + at_x;
+      int64_t* __restrict read = tap.read + corner;
+      if constexpr (S == Slopes::none) {
+        for (int m = 0; m < count; ++m) read[m] = weight[m] != 0 ? read_y[m] + read_x[m] : unseen_read;
+      } else {
+        const T sign_y = sides_y == 1 ? T(0) : (i == 0 ? -tap_y : tap_y);
+        const T sign_x = sides_x == 1 ? T(0) : (j == 0 ? -tap_x : tap_x);
+        T* __restrict slope = tap.slope + corner;
+        T* __restrict slope_x = tap.slope_x + corner;
+        for (int m = 0; m < count; ++m) {
+          T along_y = sign_y * inside_y[m] * weight_x[m];
+          T along_x = sign_x * weight_y[m] * inside_x[m];
+          if constexpr (Guided) {
+            along_y *= visible[m];
+            along_x *= visible[m];
+          }
+          slope[m] = S == Slopes::one ? along_y + along_x : along_y;
+          if constexpr (S == Slopes::two) slope_x[m] = along_x;
+          const bool sloping = (along_y != 0) | (along_x != 0);
+          const bool seen = weight[m] != 0;
+          kinks |= sloping & !seen;
+          read[m] = sloping | seen ? read_y[m] + read_x[m] : unseen_read;
+        }
+      }
+      if constexpr (Writes) {
+        const int64_t* __restrict write_y = rows.write + at_y;
+        const int64_t* __restrict write_x = columns.write + at_x;
+        int64_t* __restrict write = tap.write + corner;
+        for (int m = 0; m < count; ++m) {
+          write[m] = weight[m] != 0 ? write_y[m] + write_x[m] : unseen_write;
+        }
+      }
+    }
+  }
+  tap.kink = kinks != 0;
+}

@@ -1,0 +1,100 @@
+// The guide in the compute type, one value a pixel, for a run of images.
+template <class T>
+struct GuideRows {
+  bool given, packed = false;
+  std::unique_ptr<T[]> memory;
+
+  GuideRows(const Conv& conv, const View& guide, int64_t images) : given(guide.data != nullptr) {
+    if (!given) return;
+    const bool same = guide.dtype == (sizeof(T) == 8 ? DType::f64 : DType::f32);
+    packed = !(same && guide.x == 1 && guide.y == conv.x.in);
+    if (packed) memory.reset(new T[static_cast<size_t>(images * conv.y.in * conv.x.in)]);
+  }
+  const T* image(const Conv& conv, const View& guide, int64_t first, int64_t n) const {
+    if (!given) return nullptr;
+    return packed ? memory.get() + (n - first) * conv.y.in * conv.x.in
+                  : static_cast<const T*>(guide.data) + n * guide.n;
+  }
+  void pack(const Conv& conv, const View& guide, int64_t first, int64_t images) {
+    if (!packed) return;
+    const int64_t pixels = conv.y.in * conv.x.in;
+    for (int64_t n = 0; n < images; ++n) {
+      load_pixels<T>(guide, first + n, 0, 1, conv.x.in, 0, pixels, memory.get() + n * pixels, 1, 1);
+    }
+  }
+};
+
+// One worker's view of the tile it is at: the geometry of up to kTile flat output pixels.
+template <class T>
+class Tile {
+ public:
+  static int64_t need(const Conv& conv, int64_t taps) {
+    return AxisTable<T>::need(conv.y) + AxisTable<T>::need(conv.x) + CornerTable<T>::need(taps);
+  }
+  Tile(const Conv& conv, int64_t taps, Workspace& memory)
+      : conv_(conv), narrow_(std::max(conv.y.reach(), conv.x.reach()) < (int64_t{1} << 28)) {
+    rows_.take(conv.y, memory);
+    columns_.take(conv.x, memory);
+    corners_.take(taps, memory);
+  }
+
+  int count() const { return count_; }
+  const TapCorners<T>& tap(int64_t index) const { return corners_.taps[static_cast<size_t>(index)]; }
+
+  // Flat output pixels first .. first+count-1 of image n.
+  void place(const View& scale, const T* guide, int64_t n, int64_t first, int count,
+             const AxisSteps& steps_y, const AxisSteps& steps_x) {
+    count_ = count;
+    T scale_y[kTile], scale_x_own[kTile];
+    load_pixels<T>(scale, n, 0, 1, conv_.x.out, first, count, scale_y, 1, 1);
+    const T* scale_x = scale_y;
+    if (conv_.scale_components == 2) {
+      load_pixels<T>(scale, n, 1, 1, conv_.x.out, first, count, scale_x_own, 1, 1);
+      scale_x = scale_x_own;
+    }
+    int64_t centre_y[kTile], centre_x[kTile];
+    guide_.image = guide;
+    guide_.tolerance = static_cast<T>(conv_.guide_tolerance);
+    int64_t y = first / conv_.x.out, x = first % conv_.x.out;
+    for (int m = 0; m < count; ++m) {
+      centre_y[m] = conv_.y.centre_floor(y);
+      centre_x[m] = conv_.x.centre_floor(x);
+      if (guide != nullptr) {
+        guide_.centre[m] = guide[conv_.y.centre_pixel(y) * conv_.x.in + conv_.x.centre_pixel(x)];
+      }
+      if (++x == conv_.x.out) {
+        x = 0;
+        ++y;
+      }
+    }
+    const auto fill = [&](auto index) {
+      using Int = decltype(index);
+      fill_axis<T, Int>(conv_.y, steps_y, count, scale_y, centre_y, rows_);
+      fill_axis<T, Int>(conv_.x, steps_x, count, scale_x, centre_x, columns_);
+    };
+    narrow_ ? fill(int32_t{}) : fill(int64_t{});
+  }
+
+  template <bool Writes, Slopes S>
+  void fill_taps(int64_t first_tap, int64_t taps, int64_t unseen_read, int64_t unseen_write) {
+    for (int64_t t = 0; t < taps; ++t) {
+      const int64_t ty = (first_tap + t) / conv_.x.kernel, tx = (first_tap + t) % conv_.x.kernel;
+      TapCorners<T>& corners = corners_.taps[static_cast<size_t>(t)];
+      if (guide_.image != nullptr) {
+        fill_corners<T, true, Writes, S>(conv_, ty, tx, count_, rows_, columns_, guide_,
+                                         unseen_read, unseen_write, corners);
+      } else {
+        fill_corners<T, false, Writes, S>(conv_, ty, tx, count_, rows_, columns_, guide_,
+                                          unseen_read, unseen_write, corners);
+      }
+    }
+  }
+
+ private:
+  const Conv& conv_;
+  const bool narrow_;
+  int count_ = 0;
+  AxisTable<T> rows_, columns_;
+  CornerTable<T> corners_;
+  GuideTile<T> guide_;
+};

@@ -1,0 +1,63 @@
+#define SURFCONV_INLINE inline __attribute__((always_inline))
+
+template <class T, int N>
+struct VecOf {
+  typedef T type __attribute__((vector_size(N * sizeof(T))));
+};
+template <class T, int N>
+using Vec = typename VecOf<T, N>::type;
+
+template <class T>
+constexpr int kLanes = SURFCONV_VECTOR_BYTES / static_cast<int>(sizeof(T));
+
+// Channels are stored in multiples of a quad, the narrowest vector of every instruction set in
+// float, so that no loop over channels needs a scalar tail.
+constexpr int64_t kQuad = 4;
+
+SURFCONV_INLINE int64_t round_up(int64_t value, int64_t multiple) {
+  return (value + multiple - 1) / multiple * multiple;
+}
+SURFCONV_INLINE int64_t to_quads(int64_t channels) { return round_up(channels, kQuad); }
+
+template <class V, class T>
+SURFCONV_INLINE V load(const T* p) {
+  V v;
+  __builtin_memcpy(&v, p, sizeof(V));
+  return v;
+}
+template <class V, class T>
+SURFCONV_INLINE void store(T* p, V v) {
+  __builtin_memcpy(p, &v, sizeof(V));
+}
+template <class V, class T>
+SURFCONV_INLINE V broadcast(T value) {
+  return value - V{};
+}
+
+// Runs body(channel, Width<lanes>) over `channels`, a multiple of kQuad, widest vectors first.
+template <int N>
+struct Width {
+  static constexpr int lanes = N;
+};
+template <class T, class Body>
+SURFCONV_INLINE void for_channels(int64_t channels, const Body& body) {
+  constexpr int full = kLanes<T>;
+  int64_t c = 0;
+  for (; c + full <= channels; c += full) body(c, Width<full>{});
+  if constexpr (full > 8) {
+    if (c + 8 <= channels) {
+      body(c, Width<8>{});
+      c += 8;
+    }
+  }
+  if constexpr (full > 4) {
+    if (c < channels) body(c, Width<4>{});
+  }
+}
+
+template <class T, class V>
+SURFCONV_INLINE T sum_lanes(V v) {
+  T total = 0;
+  for (int i = 0; i < static_cast<int>(sizeof(V) / sizeof(T)); ++i) total += v[i];
+  return total;
+}

@@ -1,0 +1,54 @@
+// Uninitialised scratch, one allocation cut into 64-byte aligned pieces.
+class Workspace {
+ public:
+  explicit Workspace(int64_t bytes) : memory_(new char[static_cast<size_t>(bytes) + 64]) {
+    next_ = memory_.get() + (64 - reinterpret_cast<uintptr_t>(memory_.get()) % 64) % 64;
+  }
+  template <class U>
+  static int64_t need(int64_t count) {
+    return round_up(count * static_cast<int64_t>(sizeof(U)), 64);
+  }
+  template <class U>
+  U* take(int64_t count) {
+    U* piece = reinterpret_cast<U*>(next_);
+    next_ += need<U>(count);
+    return piece;
+  }
+
+ private:
+  std::unique_ptr<char[]> memory_;
+  char* next_;
+};
+
+// Hands task numbers to the workers one at a time; which worker runs a task changes no result.
+template <class Body>
+void run_tasks(const Executor& executor, int64_t tasks, int workers, const Body& body) {
+  struct Queue {
+    std::atomic<int64_t> next{0};
+    int64_t tasks;
+    const Body* body;
+  } queue;
+  queue.tasks = tasks;
+  queue.body = &body;
+  executor.run(
+      workers,
+      [](void* context, int worker) {
+        Queue& shared = *static_cast<Queue*>(context);
+        for (int64_t task; (task = shared.next.fetch_add(1)) < shared.tasks;) {
+          (*shared.body)(worker, task);
+        }
+      },
+      &queue);
+}
+
+// work: rough number of multiply-adds or element moves; below a threshold threads cost more.
+SURFCONV_INLINE int workers_for(const Executor& executor, int64_t tasks, int64_t work) {
+  constexpr int64_t kWorkPerThread = 40000;
+  const int64_t useful = std::min(tasks, work / kWorkPerThread + 1);
+  return static_cast<int>(std::max<int64_t>(1, std::min<int64_t>(executor.threads, useful)));
+}
+
+// Between two objects, which plain pointer arithmetic does not cover.
+SURFCONV_INLINE int64_t byte_distance(const void* from, const void* to) {
+  return static_cast<int64_t>(reinterpret_cast<uintptr_t>(to) - reinterpret_cast<uintptr_t>(from));
+}

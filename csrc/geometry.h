@@ -1,0 +1,70 @@
+// The one relation of the operator, per axis (Chu et al., CVPR 2018, Eq. 7 in pixel form):
+//
+//   centre(o)   = stride * o - padding + dilation * (kernel - 1) / 2
+//   tap(t)      = dilation * (t - (kernel - 1) / 2)
+//   sample(o,t) = centre(o) + scale(o) * tap(t)
+//
+// Nothing else in the compiled code derives a position. centre and tap are multiples of 1/2, so
+// they are kept doubled as integers; offsets are floored relative to the centre's integer part, so
+// that precision does not depend on where in the image a tap lies.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+
+namespace surfconv {
+
+struct Axis {
+  int64_t in;
+  int64_t out;
+  int64_t kernel;
+  int64_t stride;
+  int64_t padding;  // before the first pixel; the output size is given, so the far side is implied
+  int64_t dilation;
+
+  int64_t tap_doubled(int64_t t) const { return dilation * (2 * t - (kernel - 1)); }
+
+  // Of all centres at once: stride and padding are whole pixels.
+  bool centre_is_half() const { return (dilation * (kernel - 1)) % 2 != 0; }
+
+  int64_t centre_floor(int64_t o) const {
+    return stride * o - padding + (dilation * (kernel - 1)) / 2;
+  }
+
+  // The input pixel nearest to centre(o), a half rounding down, clamped into the image: the pixel
+  // whose depth and guide stand for the output pixel.
+  int64_t centre_pixel(int64_t o) const {
+    return std::min(std::max<int64_t>(centre_floor(o), 0), in - 1);
+  }
+
+  // A tap of zero offset stays on its pixel whatever the scale: one corner, no derivative.
+  bool fixed(int64_t t) const { return tap_doubled(t) == 0; }
+
+  // Largest magnitude a centre or an image border takes: decides the width of index arithmetic.
+  int64_t reach() const {
+    return std::max(in, stride * std::max<int64_t>(out, 1) + padding + dilation * kernel);
+  }
+};
+
+// Where a sample falls: between pixel `lo` and `lo + 1`, `fraction` of the way.
+template <class T, class Int>
+struct Position {
+  Int lo;
+  T fraction;
+  bool reachable;  // false: not finite, or so far away that no image reaches it
+};
+
+// half is 0.5 where centres lie between pixels, else 0; centre is centre_floor.
+// limit bounds the offset so that centre + offset fits in Int.
+template <class T, class Int>
+inline __attribute__((always_inline)) Position<T, Int> locate(Int centre, T half, T tap, T scale,
+                                                              T limit) {
+  T offset = half + scale * tap;
+  const bool reachable = (offset < limit) & (offset > -limit);  // NaN compares false
+  offset = reachable ? offset : T(0);
+  Int whole = static_cast<Int>(offset);
+  whole -= static_cast<T>(whole) > offset ? 1 : 0;
+  return {static_cast<Int>(centre + whole), offset - static_cast<T>(whole), reachable};
+}
+
+}  // namespace surfconv

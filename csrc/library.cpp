@@ -1,0 +1,26 @@
+// Schemas and registration. Tensors are positional: torch's generated rules refuse keyword-only
+// ones. Full error messages live in the Python validator that every backend shares.
+#include <torch/csrc/stable/library.h>
+
+#include "surf_conv2d.h"
+
+STABLE_TORCH_LIBRARY(surfconv, m) {
+  m.def(
+      "surf_conv2d(Tensor input, Tensor weight, Tensor? bias, Tensor scale, Tensor? guide, "
+      "float guide_tolerance, int[] stride, int[] padding, int[] dilation, int groups) -> Tensor");
+  m.def(
+      "surf_conv2d_backward(Tensor grad_output, Tensor input, Tensor weight, Tensor scale, "
+      "Tensor? guide, float guide_tolerance, int[] stride, int[] padding, int[] dilation, "
+      "int groups, bool need_input, bool need_weight, bool need_bias, bool need_scale) "
+      "-> (Tensor, Tensor, Tensor, Tensor)");
+  m.def("cpu_capability() -> str");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(surfconv, CPU, m) {
+  m.impl("surf_conv2d", TORCH_BOX(&surfconv::surf_conv2d));
+  m.impl("surf_conv2d_backward", TORCH_BOX(&surfconv::surf_conv2d_backward));
+}
+
+STABLE_TORCH_LIBRARY_IMPL(surfconv, CompositeExplicitAutograd, m) {
+  m.impl("cpu_capability", TORCH_BOX(&surfconv::cpu_capability));
+}
