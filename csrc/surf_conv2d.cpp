@@ -92,8 +92,8 @@ cpu::Conv checked(const Tensor& input, const Tensor& weight, const Tensor& scale
                     "surf_conv2d: stride, padding or dilation out of range");
     return Axis{size, scale.size(2 + d), kernel, stride[d], padding[d], dilation[d]};
   };
-  return {axis(0),       axis(1), input.size(0), input.size(1), weight.size(0),
-          groups, scale.size(1), guide_tolerance};
+  return {axis(0),        axis(1), input.size(0), input.size(1),
+          weight.size(0), groups,  scale.size(1), guide_tolerance};
 }
 
 bool channels_last(const Tensor& tensor) {
@@ -113,9 +113,7 @@ Tensor empty_as(const Tensor& like, const std::vector<int64_t>& sizes, const Ten
                               format);
 }
 
-Tensor absent(const Tensor& like) {
-  return torch::stable::empty({0}, like.scalar_type());
-}
+Tensor absent(const Tensor& like) { return torch::stable::empty({0}, like.scalar_type()); }
 
 std::vector<int64_t> sizes_of(const Tensor& tensor) {
   const auto sizes = tensor.sizes();
@@ -144,11 +142,11 @@ Tensor surf_conv2d(const Tensor& input, const Tensor& weight, const std::optiona
                         bias->scalar_type() == input.scalar_type(),
                     "surf_conv2d: bias must be (O,) in the input's dtype");
   }
-  Tensor output =
-      empty_as(input, {conv.batch, conv.out_channels, conv.y.out, conv.x.out}, input);
+  Tensor output = empty_as(input, {conv.batch, conv.out_channels, conv.y.out, conv.x.out}, input);
   if (output.numel() == 0) return output;
-  cpu::ForwardTensors tensors{view_of(input, "input"), view_of(weight, "weight"), {},
-                              view_of(scale, "scale"), {}, view_of(output, "output")};
+  cpu::ForwardTensors tensors{
+      view_of(input, "input"),  view_of(weight, "weight"), {}, view_of(scale, "scale"), {},
+      view_of(output, "output")};
   if (bias.has_value()) tensors.bias = view_of(*bias, "bias");
   if (guide.has_value()) tensors.guide = view_of(*guide, "guide");
   cpu::active_kernels().forward(conv, tensors, executor());

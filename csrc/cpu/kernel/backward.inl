@@ -33,11 +33,11 @@ class BackwardTile {
   };
   // What a task adds to.
   struct Target {
-    const char* input;        // image, as bytes
-    char* grad_input;         // image, as bytes; null: not needed
-    T* weight;                // partials of the unit's blocks, one after the other
-    T* bias;                  // partial of all outputs, each added by its group's first block
-    T* scale;                 // partial of the image [components][pixels]
+    const char* input;  // image, as bytes
+    char* grad_input;   // image, as bytes; null: not needed
+    T* weight;          // partials of the unit's blocks, one after the other
+    T* bias;            // partial of all outputs, each added by its group's first block
+    T* scale;           // partial of the image [components][pixels]
   };
 
   BackwardTile(const Conv& conv, const BackwardTensors& tensors)
@@ -48,8 +48,9 @@ class BackwardTile {
         units_(make_units(blocks_, kBlock)),
         taps_(taps_at_once(plan_.taps, std::min(kBlock, to_quads(plan_.channels)))),
         width_(plan_.depthwise ? plan_.multiplier * kBlock : pad_width<T>(plan_.outputs)),
-        ld_rows_(pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)),
-                                       kRowPad)) + 16),
+        ld_rows_(
+            pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowPad)) +
+            16),
         needs_matrix_(tensors.grad_input.data != nullptr || tensors.grad_scale.data != nullptr),
         zeros_(static_cast<size_t>(std::max(plan_.row, ld_rows_) + 2 * kLanes<T>), T(0)) {}
 
@@ -100,13 +101,12 @@ class BackwardTile {
     const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
     stride_ = pad_width<T>(taps_ * std::min(kBlock, to_quads(plan_.channels))) * plan_.outputs;
     weights_.reset(new T[static_cast<size_t>(tasks * stride_)]);
-    run_tasks(executor, tasks, workers_for(executor, tasks, tasks * stride_),
-              [&](int, int64_t task) {
-                const int64_t first_tap = task % tap_blocks * taps_;
-                pack_backward(reader, plan_, blocks_[static_cast<size_t>(task / tap_blocks)],
-                              first_tap, std::min(taps_, plan_.taps - first_tap),
-                              weights_.get() + task * stride_);
-              });
+    run_tasks(
+        executor, tasks, workers_for(executor, tasks, tasks * stride_), [&](int, int64_t task) {
+          const int64_t first_tap = task % tap_blocks * taps_;
+          pack_backward(reader, plan_, blocks_[static_cast<size_t>(task / tap_blocks)], first_tap,
+                        std::min(taps_, plan_.taps - first_tap), weights_.get() + task * stride_);
+        });
   }
 
   int64_t need() const {
@@ -142,11 +142,11 @@ class BackwardTile {
             T* rows = scratch.rows + t * block.padded;
             const char* read = target.input + channel * static_cast<int64_t>(sizeof(T));
             char* write = nullptr;
-            if constexpr (Writes) write = target.grad_input + channel * static_cast<int64_t>(sizeof(T));
+            if constexpr (Writes)
+              write = target.grad_input + channel * static_cast<int64_t>(sizeof(T));
             if constexpr (Writes || S != Slopes::none) {
-              scatter_tap<T, Writes, S>(scratch.tile.tap(t), read, write, count, block.padded,
-                                        rows, ld_rows_, scratch.dot,
-                                        scratch.dot + kTile * kLanes<T>);
+              scatter_tap<T, Writes, S>(scratch.tile.tap(t), read, write, count, block.padded, rows,
+                                        ld_rows_, scratch.dot, scratch.dot + kTile * kLanes<T>);
             } else {
               gather_tap(scratch.tile.tap(t), read, count, block.padded, rows, ld_rows_);
             }
@@ -162,8 +162,8 @@ class BackwardTile {
       const int64_t pixels = conv_.y.out * conv_.x.out;
       for (int64_t k = 0; k < conv_.scale_components; ++k) {
         for (int m = 0; m < count; ++m) {
-          target.scale[k * pixels + begin + m] = sum_lanes<T>(
-              load<Vec<T, kLanes<T>>>(scratch.dot + (k * kTile + m) * kLanes<T>));
+          target.scale[k * pixels + begin + m] =
+              sum_lanes<T>(load<Vec<T, kLanes<T>>>(scratch.dot + (k * kTile + m) * kLanes<T>));
         }
       }
     }
@@ -215,9 +215,8 @@ class BackwardTile {
     }
     for (int64_t g = unit.blocks.front().group; g <= unit.blocks.back().group; ++g) {
       load_pixels<T>(tensors_.grad_output, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin,
-                     count,
-                     scratch.grad_out + (g - unit.blocks.front().group) * kTile * width_, width_,
-                     width_);
+                     count, scratch.grad_out + (g - unit.blocks.front().group) * kTile * width_,
+                     width_, width_);
     }
   }
 
@@ -254,13 +253,15 @@ class BackwardTile {
     }
     for (int m = 0; m < count; ++m) {
       for (int64_t t = 0; t < taps; ++t) {
-        const T* weight = weights_.get() + (first_tap + t) * plan_.multiplier * plan_.row + block.first;
+        const T* weight =
+            weights_.get() + (first_tap + t) * plan_.multiplier * plan_.row + block.first;
         T* row = scratch.rows + m * ld_rows_ + t * block.padded;
         for_channels<T>(block.padded, [&](int64_t c, auto lanes) {
           using V = Vec<T, decltype(lanes)::lanes>;
           V sum{};
           for (int64_t j = 0; j < plan_.multiplier; ++j) {
-            sum += load<V>(from + m * width_ + j * kBlock + c) * load<V>(weight + j * plan_.row + c);
+            sum +=
+                load<V>(from + m * width_ + j * kBlock + c) * load<V>(weight + j * plan_.row + c);
           }
           store(row + c, sum);
         });

@@ -4,9 +4,9 @@
 // scatter into the same gradient: each writes the input rows it owns in place and the others, into
 // which its taps reach, to spill rows of its own, added in band order afterwards.
 struct Slot {
-  int64_t first_image, images;   // within the images handled at a time
-  int64_t begin, end;            // flat output pixels
-  int64_t own_begin, own_end;    // input rows
+  int64_t first_image, images;  // within the images handled at a time
+  int64_t begin, end;           // flat output pixels
+  int64_t own_begin, own_end;   // input rows
   int64_t reach_begin, reach_end;
   std::vector<int64_t> row_offset;  // bytes from the gradient's image to each input row
 };
@@ -30,9 +30,7 @@ void find_reach(const Conv& conv, const View& scale, int64_t n, int64_t begin, i
   const double tap = static_cast<double>(std::abs(conv.y.tap_doubled(0))) / 2;
   const double spread = std::min(std::max(most, -least) * tap + 2, static_cast<double>(conv.y.in));
   const int64_t rows = static_cast<int64_t>(spread);
-  const auto clamp = [&](int64_t row) {
-    return std::min(std::max<int64_t>(row, 0), conv.y.in);
-  };
+  const auto clamp = [&](int64_t row) { return std::min(std::max<int64_t>(row, 0), conv.y.in); };
   slot.reach_begin = std::min(slot.own_begin, clamp(conv.y.centre_floor(begin) - rows - 1));
   slot.reach_end = std::max(slot.own_end, clamp(conv.y.centre_floor(end - 1) + rows + 3));
 }
@@ -59,8 +57,15 @@ std::vector<Slot> make_slots(const Conv& conv, const View& scale, int64_t first_
     for (int64_t i = 0; i < images; ++i) {
       for (int64_t band = 0; band < bands; ++band) {
         const int64_t begin = conv.y.out * band / bands, end = conv.y.out * (band + 1) / bands;
-        Slot slot{i, 1, begin * conv.x.out, end * conv.x.out,
-                  conv.y.in * band / bands, conv.y.in * (band + 1) / bands, 0, conv.y.in, {}};
+        Slot slot{i,
+                  1,
+                  begin * conv.x.out,
+                  end * conv.x.out,
+                  conv.y.in * band / bands,
+                  conv.y.in * (band + 1) / bands,
+                  0,
+                  conv.y.in,
+                  {}};
         if (bands > 1 && scatters) find_reach<T>(conv, scale, first_image + i, begin, end, slot);
         spill += slot.reach_end - slot.reach_begin - (slot.own_end - slot.own_begin);
         slots.push_back(std::move(slot));

@@ -52,16 +52,16 @@ class WeightReader {
 
   // to[i] = weight[first_output + i, channel, tap]
   void outputs(int64_t first_output, int64_t count, int64_t channel, int64_t tap, T* to) const {
-    const int64_t origin =
-        first_output * view_.n + channel * view_.c + tap / kernel_x_ * view_.y + tap % kernel_x_ * view_.x;
+    const int64_t origin = first_output * view_.n + channel * view_.c + tap / kernel_x_ * view_.y +
+                           tap % kernel_x_ * view_.x;
     visit_storage<T>(view_, [&](auto* data) {
       for (int64_t i = 0; i < count; ++i) to[i] = widen(data[origin + i * view_.n]);
     });
   }
   // to[i] = weight[output, first_channel + i, tap]
   void channels(int64_t output, int64_t first_channel, int64_t count, int64_t tap, T* to) const {
-    const int64_t origin =
-        output * view_.n + first_channel * view_.c + tap / kernel_x_ * view_.y + tap % kernel_x_ * view_.x;
+    const int64_t origin = output * view_.n + first_channel * view_.c + tap / kernel_x_ * view_.y +
+                           tap % kernel_x_ * view_.x;
     visit_storage<T>(view_, [&](auto* data) {
       for (int64_t i = 0; i < count; ++i) to[i] = widen(data[origin + i * view_.c]);
     });

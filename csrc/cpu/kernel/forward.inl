@@ -65,7 +65,8 @@ class Forward {
   void pack_weights() {
     const WeightReader<T> reader(tensors_.weight, conv_.x.kernel);
     const int64_t depth = plan_.taps * plan_.row;
-    weights_.reset(new T[static_cast<size_t>(depth * (plan_.depthwise ? plan_.multiplier : width_))]);
+    weights_.reset(
+        new T[static_cast<size_t>(depth * (plan_.depthwise ? plan_.multiplier : width_))]);
     initial_.assign(static_cast<size_t>(plan_.groups * width_), T(0));
     const int64_t stride = plan_.depthwise ? plan_.row : width_;
     if (tensors_.bias.data != nullptr) {
@@ -118,8 +119,8 @@ class Forward {
           multiply_depthwise(scratch, block, first_tap, taps, count);
         } else {
           const bool first = first_tap == 0 && block.first == 0;
-          gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded,
-                         scratch.rows, ld_rows_, packed(block, first_tap, taps),
+          gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded, scratch.rows,
+                         ld_rows_, packed(block, first_tap, taps),
                          scratch.out + block.group * width_, ld_out,
                          first ? initial_.data() + block.group * width_ : nullptr);
         }
@@ -149,8 +150,8 @@ class Forward {
       for (int64_t t = 0; t < taps; ++t) {
         const T* row = scratch.rows + m * ld_rows_ + t * block.padded;
         for (int64_t j = 0; j < plan_.multiplier; ++j) {
-          const T* weight = weights_.get() +
-                            ((first_tap + t) * plan_.multiplier + j) * plan_.row + block.first;
+          const T* weight =
+              weights_.get() + ((first_tap + t) * plan_.multiplier + j) * plan_.row + block.first;
           T* out = scratch.out + m * ld_out + j * plan_.row + block.first;
           for_channels<T>(block.padded, [&](int64_t c, auto lanes) {
             using V = Vec<T, decltype(lanes)::lanes>;

@@ -11,30 +11,30 @@ SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t ld
   using V = Vec<T, L>;
   const int64_t row_step = TransposedA ? 1 : lda;
   const int64_t depth_step = TransposedA ? lda : 1;
-#define SURFCONV_LOAD(R)                                                    \
-  V left##R{}, right##R{};                                                  \
-  if constexpr (R < ROWS) {                                                 \
-    const T* from = initial != nullptr ? initial : c + R * ldc;             \
-    left##R = load<V>(from);                                                \
-    if constexpr (VECTORS > 1) right##R = load<V>(from + L);                \
+#define SURFCONV_LOAD(R)                                        \
+  V left##R{}, right##R{};                                      \
+  if constexpr (R < ROWS) {                                     \
+    const T* from = initial != nullptr ? initial : c + R * ldc; \
+    left##R = load<V>(from);                                    \
+    if constexpr (VECTORS > 1) right##R = load<V>(from + L);    \
   }
   SURFCONV_ROWS(SURFCONV_LOAD)
   for (int64_t k = 0; k < depth; ++k) {
     const V b0 = load<V>(b);
     const V b1 = VECTORS > 1 ? load<V>(b + (VECTORS > 1 ? L : 0)) : V{};
-#define SURFCONV_FMA(R)                                     \
-  if constexpr (R < ROWS) {                                 \
-    const T value = a[R * row_step];                        \
-    left##R += value * b0;                                  \
-    if constexpr (VECTORS > 1) right##R += value * b1;      \
+#define SURFCONV_FMA(R)                                \
+  if constexpr (R < ROWS) {                            \
+    const T value = a[R * row_step];                   \
+    left##R += value * b0;                             \
+    if constexpr (VECTORS > 1) right##R += value * b1; \
   }
     SURFCONV_ROWS(SURFCONV_FMA)
     a += depth_step;
     b += ldb;
   }
-#define SURFCONV_STORE(R)                                       \
-  if constexpr (R < ROWS) {                                     \
-    store(c + R * ldc, left##R);                                \
+#define SURFCONV_STORE(R)                                        \
+  if constexpr (R < ROWS) {                                      \
+    store(c + R * ldc, left##R);                                 \
     if constexpr (VECTORS > 1) store(c + R * ldc + L, right##R); \
   }
   SURFCONV_ROWS(SURFCONV_STORE)

@@ -105,8 +105,8 @@ class Backward {
     const int64_t tasks = static_cast<int64_t>(slots.size()) * units();
     int64_t pixels = 0;
     for (const Slot& slot : slots) pixels += slot.images * (slot.end - slot.begin);
-    const int workers = workers_for(
-        executor_, tasks, pixels * plan.taps * plan.channels * conv_.out_channels);
+    const int workers =
+        workers_for(executor_, tasks, pixels * plan.taps * plan.channels * conv_.out_channels);
     Workspace memory(workers * tile_.need());
     std::vector<typename BackwardTile<T>::Scratch> scratch;
     scratch.reserve(static_cast<size_t>(workers));
@@ -146,14 +146,15 @@ class Backward {
 
   void add_spill(int64_t first, const std::vector<Slot>& slots) {
     if (!scatters() || !spill_) return;
-    run_tasks(executor_, conv_.y.in,
-              workers_for(executor_, conv_.y.in, image_elements()), [&](int, int64_t y) {
+    run_tasks(executor_, conv_.y.in, workers_for(executor_, conv_.y.in, image_elements()),
+              [&](int, int64_t y) {
                 for (const Slot& slot : slots) {
                   const bool own = y >= slot.own_begin && y < slot.own_end;
                   if (own || y < slot.reach_begin || y >= slot.reach_end) continue;
                   T* image = gradient_image(first, first + slot.first_image);
-                  const T* from = reinterpret_cast<const T*>(
-                      reinterpret_cast<const char*>(image) + slot.row_offset[static_cast<size_t>(y)]);
+                  const T* from =
+                      reinterpret_cast<const T*>(reinterpret_cast<const char*>(image) +
+                                                 slot.row_offset[static_cast<size_t>(y)]);
                   T* to = image + y * row_elements();
                   for (int64_t i = 0; i < row_elements(); ++i) to[i] += from[i];
                 }
@@ -169,11 +170,11 @@ class Backward {
                 const int64_t n = first + task / strips, begin = task % strips * strip;
                 const int64_t count = std::min(strip, in_pixels() - begin);
                 for (int64_t g = 0; g < plan.groups; ++g) {
-                  store_pixels<T>(tensors_.grad_input, n, g * plan.channels, plan.channels,
-                                  conv_.x.in, begin, count,
-                                  gradient_image(first, n) + begin * plan.row +
-                                      g * to_quads(plan.channels),
-                                  plan.row);
+                  store_pixels<T>(
+                      tensors_.grad_input, n, g * plan.channels, plan.channels, conv_.x.in, begin,
+                      count,
+                      gradient_image(first, n) + begin * plan.row + g * to_quads(plan.channels),
+                      plan.row);
                 }
               });
   }

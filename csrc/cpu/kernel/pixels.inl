@@ -88,8 +88,7 @@ SURFCONV_INLINE void transpose_4x4(const T* from, int64_t from_row, T* to, int64
   store(to + 3 * to_row, SURFCONV_SHUFFLE(T, 4, ab_hi, cd_hi, 2, 3, 6, 7));
 }
 
-SURFCONV_INLINE void transpose_8x8(const float* from, int64_t from_row, float* to,
-                                   int64_t to_row) {
+SURFCONV_INLINE void transpose_8x8(const float* from, int64_t from_row, float* to, int64_t to_row) {
   using V = Vec<float, 8>;
   V r[8], s[8];
 #pragma GCC unroll 8
@@ -137,7 +136,8 @@ void transpose(const T* from, int64_t from_row, int64_t rows, int64_t columns, T
     }
   }
   for (; column < columns; ++column) {
-    for (int64_t row = 0; row < rows; ++row) to[column * to_row + row] = from[row * from_row + column];
+    for (int64_t row = 0; row < rows; ++row)
+      to[column * to_row + row] = from[row * from_row + column];
   }
 }
 

@@ -29,6 +29,21 @@ struct AxisSteps {
   const int64_t* write_rows = nullptr;
 };
 
+// (lo + side) * step; a step of 32 bits lets a narrow Int use the widening multiply.
+template <class Int>
+SURFCONV_INLINE void fill_offsets(const Int* __restrict lo, int count, int sides, int64_t step,
+                                  int64_t* __restrict to) {
+  if (sizeof(Int) == 4 && step == static_cast<int32_t>(step)) {
+    const int32_t narrow_step = static_cast<int32_t>(step);
+    for (int m = 0; m < count; ++m) to[m] = static_cast<int64_t>(lo[m]) * narrow_step;
+  } else {
+    for (int m = 0; m < count; ++m) to[m] = static_cast<int64_t>(lo[m]) * step;
+  }
+  if (sides == 2) {
+    for (int m = 0; m < count; ++m) to[kTile + m] = to[m] + step;
+  }
+}
+
 template <class T, class Int>
 void fill_axis(const Axis& axis, const AxisSteps& steps, int count, const T* __restrict scale,
                const int64_t* __restrict centre, const AxisTable<T>& table) {
@@ -49,7 +64,8 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, int count, const T* __r
       }
     } else {
       for (int m = 0; m < count; ++m) {
-        const auto position = locate<T, Int>(static_cast<Int>(centre[m]), half, tap, scale[m], limit);
+        const auto position =
+            locate<T, Int>(static_cast<Int>(centre[m]), half, tap, scale[m], limit);
         const bool in_lo = position.reachable & (position.lo >= 0) & (position.lo < size);
         const bool in_hi = position.reachable & (position.lo >= -1) & (position.lo < size - 1);
         lo[m] = position.lo;
@@ -60,23 +76,18 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, int count, const T* __r
       }
     }
     const int sides = axis.fixed(t) ? 1 : 2;
-    for (int side = 0; side < sides; ++side) {
-      int64_t* __restrict read = table.read + at + side * kTile;
-      int64_t* __restrict pixel = table.pixel + at + side * kTile;
-      for (int m = 0; m < count; ++m) {
-        const int64_t index = static_cast<int64_t>(lo[m]) + side;
-        read[m] = index * steps.read;
-        pixel[m] = index * steps.pixel;
-      }
-      int64_t* __restrict write = table.write + at + side * kTile;
-      if (steps.write_rows != nullptr) {
+    fill_offsets(lo, count, sides, steps.read, table.read + at);
+    if (steps.pixel != 0) fill_offsets(lo, count, sides, steps.pixel, table.pixel + at);
+    if (steps.write_rows != nullptr) {
+      for (int side = 0; side < sides; ++side) {
         for (int m = 0; m < count; ++m) {
           const bool in = inside[side * kTile + m] != 0;
-          write[m] = in ? steps.write_rows[static_cast<int64_t>(lo[m]) + side] : 0;
+          table.write[at + side * kTile + m] =
+              in ? steps.write_rows[static_cast<int64_t>(lo[m]) + side] : 0;
         }
-      } else if (steps.write != 0) {
-        for (int m = 0; m < count; ++m) write[m] = (static_cast<int64_t>(lo[m]) + side) * steps.write;
       }
+    } else if (steps.write != 0) {
+      fill_offsets(lo, count, sides, steps.write, table.write + at);
     }
   }
 }
@@ -86,7 +97,8 @@ template <class T>
 struct GuideTile {
   const T* image = nullptr;  // the whole image's guide, pixel by pixel; null: no guide
   T tolerance = 0;
-  T centre[kTile];  // not finite: the guide does not apply
+  T centre[kTile];
+  T exempt[kTile];  // 1 where the centre's own value is not finite: all corners are visible
 };
 
 // Corners of one tap: 1, 2 or 4 of them, [corner][kTile]. A corner of zero weight is never seen:
@@ -121,8 +133,13 @@ struct CornerTable {
     write = memory.take<int64_t>(entries(count));
     taps.resize(static_cast<size_t>(count));
     for (int64_t t = 0; t < count; ++t) {
-      taps[t] = {4, false, weight + t * 4 * kTile, read + t * 4 * kTile, write + t * 4 * kTile,
-                 slope + t * 8 * kTile, slope + t * 8 * kTile + 4 * kTile};
+      taps[t] = {4,
+                 false,
+                 weight + t * 4 * kTile,
+                 read + t * 4 * kTile,
+                 write + t * 4 * kTile,
+                 slope + t * 8 * kTile,
+                 slope + t * 8 * kTile + 4 * kTile};
     }
   }
 };
@@ -152,12 +169,16 @@ void fill_corners(const Conv& conv, int64_t ty, int64_t tx, int count, const Axi
       if constexpr (Guided) {
         const int64_t* __restrict pixel_y = rows.pixel + at_y;
         const int64_t* __restrict pixel_x = columns.pixel + at_x;
+        int64_t pixel[kTile];
         for (int m = 0; m < count; ++m) {
           const bool in = (inside_y[m] != 0) & (inside_x[m] != 0);
-          const T value = guide.image[in ? pixel_y[m] + pixel_x[m] : 0];
-          const T centre = guide.centre[m];
-          const bool applies = centre - centre == 0;
-          visible[m] = !applies | (std::fabs(value - centre) <= guide.tolerance) ? T(1) : T(0);
+          pixel[m] = in ? pixel_y[m] + pixel_x[m] : 0;
+        }
+        T value[kTile];
+        for (int m = 0; m < count; ++m) value[m] = guide.image[pixel[m]];
+        for (int m = 0; m < count; ++m) {
+          const T distance = std::fabs(value[m] - guide.centre[m]);
+          visible[m] = distance <= guide.tolerance ? T(1) : guide.exempt[m];
         }
       }
       for (int m = 0; m < count; ++m) {
@@ -168,7 +189,8 @@ void fill_corners(const Conv& conv, int64_t ty, int64_t tx, int count, const Axi
       const int64_t* __restrict read_x = columns.read + at_x;
       int64_t* __restrict read = tap.read + corner;
       if constexpr (S == Slopes::none) {
-        for (int m = 0; m < count; ++m) read[m] = weight[m] != 0 ? read_y[m] + read_x[m] : unseen_read;
+        for (int m = 0; m < count; ++m)
+          read[m] = weight[m] != 0 ? read_y[m] + read_x[m] : unseen_read;
       } else {
         const T sign_y = sides_y == 1 ? T(0) : (i == 0 ? -tap_y : tap_y);
         const T sign_x = sides_x == 1 ? T(0) : (j == 0 ? -tap_x : tap_x);

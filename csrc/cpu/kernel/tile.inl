@@ -39,12 +39,15 @@ class Tile {
   }
 
   int count() const { return count_; }
-  const TapCorners<T>& tap(int64_t index) const { return corners_.taps[static_cast<size_t>(index)]; }
+  const TapCorners<T>& tap(int64_t index) const {
+    return corners_.taps[static_cast<size_t>(index)];
+  }
 
   // Flat output pixels first .. first+count-1 of image n.
   void place(const View& scale, const T* guide, int64_t n, int64_t first, int count,
-             const AxisSteps& steps_y, const AxisSteps& steps_x) {
+             AxisSteps steps_y, AxisSteps steps_x) {
     count_ = count;
+    if (guide == nullptr) steps_y.pixel = steps_x.pixel = 0;
     T scale_y[kTile], scale_x_own[kTile];
     load_pixels<T>(scale, n, 0, 1, conv_.x.out, first, count, scale_y, 1, 1);
     const T* scale_x = scale_y;
@@ -60,7 +63,9 @@ class Tile {
       centre_y[m] = conv_.y.centre_floor(y);
       centre_x[m] = conv_.x.centre_floor(x);
       if (guide != nullptr) {
-        guide_.centre[m] = guide[conv_.y.centre_pixel(y) * conv_.x.in + conv_.x.centre_pixel(x)];
+        const T value = guide[conv_.y.centre_pixel(y) * conv_.x.in + conv_.x.centre_pixel(x)];
+        guide_.centre[m] = value;
+        guide_.exempt[m] = value - value == 0 ? T(0) : T(1);
       }
       if (++x == conv_.x.out) {
         x = 0;

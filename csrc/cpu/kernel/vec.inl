@@ -35,10 +35,36 @@ SURFCONV_INLINE V broadcast(T value) {
 }
 
 // Runs body(channel, Width<lanes>) over `channels`, a multiple of kQuad, widest vectors first.
+// channels is an int64_t, or a Fixed<N>: then the loop is unrolled.
 template <int N>
 struct Width {
   static constexpr int lanes = N;
 };
+template <int64_t N>
+struct Fixed {
+  static constexpr int64_t value = N;
+};
+template <class T, int64_t N, class Body>
+SURFCONV_INLINE void for_channels(Fixed<N>, const Body& body) {
+#pragma GCC unroll 16
+  for (int64_t c = 0; c < N; c += kLanes<T>) body(c, Width<kLanes<T>>{});
+}
+
+// Calls body with the count as a Fixed where it is one that nets have, else as it is.
+template <class T, class Body>
+SURFCONV_INLINE void with_channels(int64_t channels, const Body& body) {
+  switch (channels) {
+    case 64:
+      return body(Fixed<64>{});
+    case 32:
+      return body(Fixed<32>{});
+    case 16:
+      return body(Fixed<16>{});
+    default:
+      return body(channels);
+  }
+}
+
 template <class T, class Body>
 SURFCONV_INLINE void for_channels(int64_t channels, const Body& body) {
   constexpr int full = kLanes<T>;
