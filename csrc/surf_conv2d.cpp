@@ -32,9 +32,10 @@ DType dtype_of(const Tensor& tensor, const char* name) {
   return DType::f32;
 }
 
-View view_of(const Tensor& tensor, const char* name) {
+View view_of(const Tensor& tensor, const char* name, bool written = false) {
   View view;
-  view.data = tensor.data_ptr();
+  // The kernels only read what is not written; the const pointer leaves a lazy copy lazy.
+  view.data = written ? tensor.mutable_data_ptr() : const_cast<void*>(tensor.const_data_ptr());
   view.dtype = dtype_of(tensor, name);
   const auto strides = tensor.strides();
   switch (tensor.dim()) {
@@ -145,8 +146,8 @@ Tensor surf_conv2d(const Tensor& input, const Tensor& weight, const std::optiona
   Tensor output = empty_as(input, {conv.batch, conv.out_channels, conv.y.out, conv.x.out}, input);
   if (output.numel() == 0) return output;
   cpu::ForwardTensors tensors{
-      view_of(input, "input"),  view_of(weight, "weight"), {}, view_of(scale, "scale"), {},
-      view_of(output, "output")};
+      view_of(input, "input"),        view_of(weight, "weight"), {}, view_of(scale, "scale"), {},
+      view_of(output, "output", true)};
   if (bias.has_value()) tensors.bias = view_of(*bias, "bias");
   if (guide.has_value()) tensors.guide = view_of(*guide, "guide");
   cpu::active_kernels().forward(conv, tensors, executor());
@@ -181,10 +182,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor> surf_conv2d_backward(
                                {},
                                {}};
   if (guide.has_value()) tensors.guide = view_of(*guide, "guide");
-  if (need_input) tensors.grad_input = view_of(grad_input, "grad_input");
-  if (need_weight) tensors.grad_weight = view_of(grad_weight, "grad_weight");
-  if (need_bias) tensors.grad_bias = view_of(grad_bias, "grad_bias");
-  if (need_scale) tensors.grad_scale = view_of(grad_scale, "grad_scale");
+  if (need_input) tensors.grad_input = view_of(grad_input, "grad_input", true);
+  if (need_weight) tensors.grad_weight = view_of(grad_weight, "grad_weight", true);
+  if (need_bias) tensors.grad_bias = view_of(grad_bias, "grad_bias", true);
+  if (need_scale) tensors.grad_scale = view_of(grad_scale, "grad_scale", true);
   cpu::active_kernels().backward(conv, tensors, executor());
   return {grad_input, grad_weight, grad_bias, grad_scale};
 }

@@ -8,6 +8,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "tile.inl"
 #include "gemm.inl"
 #include "blocks.inl"
+#include "depthwise.inl"
 #include "gather.inl"
 #include "scatter.inl"
 #include "forward.inl"

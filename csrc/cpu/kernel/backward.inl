@@ -251,22 +251,8 @@ class BackwardTile {
                      scratch.rows, ld_rows_, zeros_.data());
       return;
     }
-    for (int m = 0; m < count; ++m) {
-      for (int64_t t = 0; t < taps; ++t) {
-        const T* weight =
-            weights_.get() + (first_tap + t) * plan_.multiplier * plan_.row + block.first;
-        T* row = scratch.rows + m * ld_rows_ + t * block.padded;
-        for_channels<T>(block.padded, [&](int64_t c, auto lanes) {
-          using V = Vec<T, decltype(lanes)::lanes>;
-          V sum{};
-          for (int64_t j = 0; j < plan_.multiplier; ++j) {
-            sum +=
-                load<V>(from + m * width_ + j * kBlock + c) * load<V>(weight + j * plan_.row + c);
-          }
-          store(row + c, sum);
-        });
-      }
-    }
+    depthwise_matrix_gradient<T>(depthwise(block, first_tap, taps), count, from, width_, kBlock,
+                                 weights_.get(), scratch.rows, ld_rows_);
   }
 
   void weight_gradient(Scratch& scratch, const Unit& unit, const ChannelBlock& block,
@@ -283,19 +269,14 @@ class BackwardTile {
                          weight + first_tap * block.padded * width_, width_);
       return;
     }
-    for (int m = 0; m < count; ++m) {
-      for (int64_t t = 0; t < taps; ++t) {
-        const T* row = scratch.rows + m * ld_rows_ + t * block.padded;
-        for (int64_t j = 0; j < plan_.multiplier; ++j) {
-          T* to = weight + ((first_tap + t) * plan_.multiplier + j) * block.padded;
-          for_channels<T>(block.padded, [&](int64_t c, auto lanes) {
-            using V = Vec<T, decltype(lanes)::lanes>;
-            const V gradient = load<V>(from + m * width_ + j * kBlock + c);
-            store(to + c, V(load<V>(to + c) + load<V>(row + c) * gradient));
-          });
-        }
-      }
-    }
+    depthwise_weight_gradient<T>(depthwise(block, first_tap, taps), count, scratch.rows, ld_rows_,
+                                 from, width_, kBlock,
+                                 weight + first_tap * plan_.multiplier * block.padded);
+  }
+
+  DepthwiseBlock depthwise(const ChannelBlock& block, int64_t first_tap, int64_t taps) const {
+    return {plan_.multiplier, block.padded, taps, plan_.row,
+            first_tap * plan_.multiplier * plan_.row + block.first};
   }
 
   int64_t block_index(const Unit& unit) const {

@@ -116,7 +116,10 @@ class Forward {
                      scratch.rows + t * block.padded, ld_rows_);
         }
         if (plan_.depthwise) {
-          multiply_depthwise(scratch, block, first_tap, taps, count);
+          const DepthwiseBlock part{plan_.multiplier, block.padded, taps, plan_.row,
+                                    first_tap * plan_.multiplier * plan_.row + block.first};
+          depthwise_multiply<T>(part, count, scratch.rows, ld_rows_, weights_.get(),
+                                scratch.out + block.first, ld_out, plan_.row);
         } else {
           const bool first = first_tap == 0 && block.first == 0;
           gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded, scratch.rows,
@@ -139,25 +142,6 @@ class Forward {
       for (int64_t g = 0; g < plan_.groups; ++g) {
         store_pixels<T>(tensors_.output, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin,
                         count, scratch.out + g * width_, ld_out);
-      }
-    }
-  }
-
-  void multiply_depthwise(Scratch& scratch, const ChannelBlock& block, int64_t first_tap,
-                          int64_t taps, int count) {
-    const int64_t ld_out = plan_.groups * width_;
-    for (int m = 0; m < count; ++m) {
-      for (int64_t t = 0; t < taps; ++t) {
-        const T* row = scratch.rows + m * ld_rows_ + t * block.padded;
-        for (int64_t j = 0; j < plan_.multiplier; ++j) {
-          const T* weight =
-              weights_.get() + ((first_tap + t) * plan_.multiplier + j) * plan_.row + block.first;
-          T* out = scratch.out + m * ld_out + j * plan_.row + block.first;
-          for_channels<T>(block.padded, [&](int64_t c, auto lanes) {
-            using V = Vec<T, decltype(lanes)::lanes>;
-            store(out + c, V(load<V>(out + c) + load<V>(row + c) * load<V>(weight + c)));
-          });
-        }
       }
     }
   }

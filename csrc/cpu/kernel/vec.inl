@@ -50,19 +50,15 @@ SURFCONV_INLINE void for_channels(Fixed<N>, const Body& body) {
   for (int64_t c = 0; c < N; c += kLanes<T>) body(c, Width<kLanes<T>>{});
 }
 
-// Calls body with the count as a Fixed where it is one that nets have, else as it is.
+// Calls body with the count as a Fixed where it is one that nets have in float32.
 template <class T, class Body>
 SURFCONV_INLINE void with_channels(int64_t channels, const Body& body) {
-  switch (channels) {
-    case 64:
-      return body(Fixed<64>{});
-    case 32:
-      return body(Fixed<32>{});
-    case 16:
-      return body(Fixed<16>{});
-    default:
-      return body(channels);
+  if constexpr (sizeof(T) == 4) {
+    if (channels == 64) return body(Fixed<64>{});
+    if (channels == 32) return body(Fixed<32>{});
+    if (channels == 16) return body(Fixed<16>{});
   }
+  body(channels);
 }
 
 template <class T, class Body>
