@@ -1,0 +1,111 @@
+"""Checks of single arguments: numbers, pairs, depth.
+
+Every message names the argument, what came, and what was expected. Values raise ValueError, types
+raise TypeError.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any, Literal
+
+from torch import Tensor
+
+from .geometry import FloatPair, Pair
+
+PairArgument = int | Sequence[int]
+PaddingArgument = int | Sequence[int] | Literal["same", "valid"]
+FloatPairArgument = float | Sequence[float]
+
+
+def check_integer(value: Any, name: str, minimum: int) -> int:
+    """An integer of at least ``minimum``."""
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise TypeError(f"{name}: expected an integer, got {value!r} of type {type_name(value)}")
+    if value < minimum:
+        raise ValueError(f"{name}: expected at least {minimum}, got {value}")
+    return value
+
+
+def check_pair(value: Any, name: str, minimum: int) -> Pair:
+    """An integer or a (y, x) pair of integers, each of at least ``minimum``."""
+    if isinstance(value, int):
+        single = check_integer(value, name, minimum)
+        return single, single
+    if not isinstance(value, (tuple, list)):
+        raise TypeError(
+            f"{name}: expected an integer or a (y, x) pair of integers,"
+            f" got {value!r} of type {type_name(value)}"
+        )
+    if len(value) != 2:
+        raise ValueError(
+            f"{name}: expected an integer or a (y, x) pair of integers,"
+            f" got {len(value)} values: {value!r}"
+        )
+    return check_integer(value[0], name, minimum), check_integer(value[1], name, minimum)
+
+
+def check_number(value: Any, name: str) -> float:
+    """A real number, NaN excluded."""
+    if isinstance(value, bool) or not isinstance(value, (float, int, Real)):
+        raise TypeError(f"{name}: expected a number, got {value!r} of type {type_name(value)}")
+    number = float(value)
+    # torch.compile knows comparisons of symbolic floats, but not math.isnan.
+    if number != number:
+        raise ValueError(f"{name}: expected a number, got NaN")
+    return number
+
+
+def check_finite(value: Any, name: str) -> float:
+    """A finite real number."""
+    number = check_number(value, name)
+    if not -math.inf < number < math.inf:
+        raise ValueError(f"{name}: expected a finite number, got {number}")
+    return number
+
+
+def check_not_negative(value: Any, name: str) -> float:
+    """A real number that is zero or greater; infinity is allowed."""
+    number = check_number(value, name)
+    if number < 0:
+        raise ValueError(f"{name}: expected zero or more, got {number}")
+    return number
+
+
+def check_positive(value: Any, name: str, meaning: str) -> float:
+    """A positive, finite real number; ``meaning`` tells its unit and role in the message."""
+    number = check_number(value, name)
+    if not 0 < number < math.inf:
+        raise ValueError(f"{name}: expected a positive, finite number ({meaning}), got {number}")
+    return number
+
+
+def check_positive_pair(value: Any, name: str, meaning: str) -> float | FloatPair:
+    """A positive, finite number, or a (y, x) pair of them."""
+    if not isinstance(value, (tuple, list)):
+        return check_positive(value, name, meaning)
+    if len(value) != 2:
+        raise ValueError(
+            f"{name}: expected a number or a (y, x) pair of numbers ({meaning}),"
+            f" got {len(value)} values: {value!r}"
+        )
+    return check_positive(value[0], name, meaning), check_positive(value[1], name, meaning)
+
+
+def check_depth_tensor(depth: Any, name: str = "depth") -> Tensor:
+    """A tensor of floating-point depth in metres."""
+    if not isinstance(depth, Tensor):
+        raise TypeError(f"{name}: expected a tensor, got {type_name(depth)}")
+    if not depth.is_floating_point():
+        raise TypeError(
+            f"{name}: expected floating-point metres, got {depth.dtype}; sensors often store"
+            f" integer millimetres: convert with {name}.float() / 1000 (or by your sensor's unit)"
+        )
+    return depth
+
+
+def type_name(value: Any) -> str:
+    """Name of a value's type, for messages."""
+    return type(value).__name__

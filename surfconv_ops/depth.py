@@ -1,0 +1,224 @@
+"""From depth to scale, and from the input's grid to the output's."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import geometry
+from .checks import (
+    FloatPairArgument,
+    PaddingArgument,
+    PairArgument,
+    check_depth_tensor,
+    check_finite,
+    check_not_negative,
+    check_positive_pair,
+)
+from .geometry import FloatPair
+from .levels import DepthLevels, valid_depth
+from .validation import Window, check_window
+
+#: Share of clamped valid pixels beyond which clamping is probably a mistake in units.
+CLAMPED_SHARE_TO_WARN = 0.1
+
+_warned_of_clamping = False
+
+
+def depth_to_scale(
+    depth: Tensor,
+    reference_depth: FloatPairArgument,
+    *,
+    levels: DepthLevels | None = None,
+    invalid_scale: float = 1.0,
+    min_scale: float = 0.0,
+    max_scale: float = math.inf,
+) -> Tensor:
+    """Scale of the tap spacing at every depth: ``reference_depth / depth``.
+
+    A surface at ``reference_depth`` gets scale 1, the ordinary convolution; one at twice that
+    depth gets 0.5. With ``levels`` the depth is first replaced by its level's representative
+    depth. Depths that are zero, negative, NaN or infinite are invalid, which is normal, and get
+    ``invalid_scale``.
+
+    The gradient flows to ``depth``. It is 0 where the depth is invalid, where the scale is
+    clamped, with ``levels``, and where a depth is so small that the derivative is not a finite
+    number. When more than 10 % of the valid pixels of a call are clamped, a warning says so,
+    once per process (never while compiling).
+
+    Args:
+        depth: Metres, floating point.
+        reference_depth: Depth in metres at which the scale is 1; a (y, x) pair puts a dimension
+            of 2 before the last two.
+        levels: Depth levels, for the paper's levels mode; None for continuous mode.
+        invalid_scale: Scale of pixels without a valid depth; finite.
+        min_scale: Scales below it become it.
+        max_scale: Scales above it become it. Without a limit, scales stop at the dtype's largest
+            finite number.
+
+    Returns:
+        Scale without unit: float64 for float64 depth, float32 for all others.
+
+    Shape:
+        - depth: ``(..., H, W)``
+        - output: the same, or ``(..., 2, H, W)`` for a (y, x) pair
+
+    Raises:
+        ValueError: ``reference_depth`` is not positive and finite, or another number is out of
+            its range.
+        TypeError: ``depth`` is not a floating-point tensor, or another type is wrong.
+
+    Source:
+        Chu et al., *SurfConv*, CVPR 2018, Eq. 7 (continuous) and section 3.3 (levels).
+
+    Example:
+        >>> import torch
+        >>> from surfconv_ops import depth_to_scale
+        >>> depth_to_scale(torch.tensor([[1.0, 2.0, 4.0, 0.0]]), reference_depth=2.0)
+        tensor([[2.0000, 1.0000, 0.5000, 1.0000]])
+    """
+    check_depth_tensor(depth)
+    reference = check_reference_depth(reference_depth)
+    invalid_scale, min_scale, max_scale = check_scale_limits(invalid_scale, min_scale, max_scale)
+    check_levels(levels)
+    if isinstance(reference, tuple) and depth.ndim < 2:
+        raise ValueError(
+            "depth: expected (..., H, W) with a (y, x) pair as reference_depth,"
+            f" got {tuple(depth.shape)}"
+        )
+    metres = depth if levels is None else levels.quantize(depth)
+    metres = metres.to(torch.float64 if depth.dtype == torch.float64 else torch.float32)
+    valid = valid_depth(metres)
+    if isinstance(reference, tuple):
+        wanted = torch.stack([_divide(r, metres, valid, depth.dtype) for r in reference], -3)
+        valid = valid.unsqueeze(-3)
+    else:
+        wanted = _divide(reference, metres, valid, depth.dtype)
+    clamped = valid & ((wanted < min_scale) | (wanted > max_scale))
+    if min_scale > 0 or max_scale < math.inf:
+        _warn_of_clamping(clamped, valid, min_scale, max_scale)
+    largest = torch.finfo(wanted.dtype).max
+    limited = wanted.detach().clamp(min_scale, min(max_scale, largest))
+    scale = torch.where(clamped | (wanted > largest), limited, wanted)
+    return torch.where(valid, scale, invalid_scale)
+
+
+def _divide(reference: float, metres: Tensor, valid: Tensor, dtype: torch.dtype) -> Tensor:
+    """``reference / metres``, constant where invalid or where its derivative would overflow."""
+    safe = torch.where(valid, metres, 1.0)
+    constant = (reference / safe).detach()
+    # The derivative also has to fit the depth's own dtype, which may be a half type.
+    steepness = constant / safe.detach()
+    smooth = valid & (steepness <= torch.finfo(dtype).max)
+    return torch.where(smooth, reference / torch.where(smooth, safe, 1.0), constant)
+
+
+def at_output_centers(
+    map: Tensor,
+    kernel_size: PairArgument,
+    stride: PairArgument = 1,
+    padding: PaddingArgument = 0,
+    dilation: PairArgument = 1,
+) -> Tensor:
+    """A map at the input's resolution, read at the centre of every output pixel's window.
+
+    The centre is ``stride * o - padding + dilation * (kernel - 1) / 2``; the nearest pixel is
+    read, a half rounding down, clamped into the image. This is where a convolution reads the
+    depth that stands for an output pixel.
+
+    Args:
+        map: Any dtype; gradients flow through it.
+        kernel_size: As in :class:`torch.nn.Conv2d`.
+        stride: As in :class:`torch.nn.Conv2d`.
+        padding: As in :class:`torch.nn.Conv2d`, ``'same'`` and ``'valid'`` included.
+        dilation: As in :class:`torch.nn.Conv2d`.
+
+    Returns:
+        The values read, in the map's dtype.
+
+    Shape:
+        - map: ``(N, H, W)`` or ``(N, K, H, W)``; ``(H, W)`` without a batch
+        - output: the same with ``(Ho, Wo)``, the convolution's output size, at the end
+
+    Raises:
+        ValueError: An argument's value or shape is wrong, or the output would be empty.
+        TypeError: An argument's type is wrong.
+
+    Example:
+        >>> import torch
+        >>> from surfconv_ops import at_output_centers
+        >>> depth = torch.arange(16.0).reshape(1, 4, 4)
+        >>> at_output_centers(depth, kernel_size=3, stride=2, padding=1)
+        tensor([[[ 0.,  2.],
+                 [ 8., 10.]]])
+    """
+    if not isinstance(map, Tensor):
+        raise TypeError(f"map: expected a tensor, got {type(map).__name__}")
+    if map.ndim not in (2, 3, 4):
+        raise ValueError(f"map: expected (N, H, W), (N, K, H, W) or (H, W), got {tuple(map.shape)}")
+    size = (map.shape[-2], map.shape[-1])
+    window = check_window(size, kernel_size, stride, padding, dilation, size_name="map")
+    return read_at_centers(map, window)
+
+
+def read_at_centers(map: Tensor, window: Window) -> Tensor:
+    """:func:`at_output_centers` with a checked window."""
+    for i in (0, 1):
+        pixels = geometry.centre_pixels(
+            window.output[i],
+            window.kernel[i],
+            window.stride[i],
+            window.padding_before[i],
+            window.dilation[i],
+            map.device,
+        )
+        map = map.index_select(i - 2, pixels.clamp(0, map.shape[i - 2] - 1))
+    return map
+
+
+def check_reference_depth(reference_depth: Any) -> float | FloatPair:
+    """A positive, finite depth in metres, or a (y, x) pair of them."""
+    return check_positive_pair(reference_depth, "reference_depth", "metres at which scale is 1")
+
+
+def check_scale_limits(
+    invalid_scale: Any, min_scale: Any, max_scale: Any
+) -> tuple[float, float, float]:
+    """The three numbers that bound what depth turns into."""
+    invalid = check_finite(invalid_scale, "invalid_scale")
+    low = check_not_negative(min_scale, "min_scale")
+    low = check_finite(low, "min_scale")
+    high = check_not_negative(max_scale, "max_scale")
+    if high < low:
+        raise ValueError(f"max_scale: expected at least min_scale = {low}, got {high}")
+    return invalid, low, high
+
+
+def check_levels(levels: Any) -> None:
+    """DepthLevels or None."""
+    if levels is not None and not isinstance(levels, DepthLevels):
+        raise TypeError(f"levels: expected DepthLevels or None, got {type(levels).__name__}")
+
+
+def _warn_of_clamping(clamped: Tensor, valid: Tensor, low: float, high: float) -> None:
+    global _warned_of_clamping
+    if _warned_of_clamping or torch.compiler.is_compiling():
+        return
+    try:
+        count, total = int(clamped.sum()), int(valid.expand_as(clamped).sum())
+    except RuntimeError:
+        # Under vmap and in traces values cannot be read; an eager call will tell.
+        return
+    if total and count / total > CLAMPED_SHARE_TO_WARN:
+        _warned_of_clamping = True
+        warnings.warn(
+            f"depth_to_scale: {count / total:.0%} of the valid pixels have a scale outside"
+            f" [min_scale, max_scale] = [{low}, {high}] and were clamped; check that depth and"
+            " reference_depth are both in metres. This is said once.",
+            UserWarning,
+            stacklevel=3,
+        )

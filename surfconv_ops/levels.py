@@ -1,0 +1,184 @@
+"""Depth levels: a partition of depth into intervals, each with a depth that stands for it."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .checks import check_depth_tensor, check_finite, check_positive
+
+_FORMAT = "surfconv_ops.DepthLevels"
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class DepthLevels:
+    """N depth levels: level k holds ``edges[k-1] < z <= edges[k]`` and stands at ``centers[k]``.
+
+    The first level reaches down to 0, the last one has no upper end. Depths that are zero,
+    negative, NaN or infinite are invalid and belong to no level. Instances do not change, compare
+    by value, and can be hashed, pickled and stored as JSON.
+
+    Args:
+        edges: The N-1 inner boundaries in metres, ascending; a sequence, tensor or array.
+        centers: The N representative depths in metres, ascending.
+        gamma: Exponent of the importance z**gamma that the levels were chosen by, kept as a
+            record; None where they were chosen otherwise.
+
+    Raises:
+        ValueError: A depth is not positive and finite, the order is not ascending, or the numbers
+            of edges and centers do not match.
+        TypeError: An argument is of the wrong type.
+
+    Source:
+        Chu et al., *SurfConv*, CVPR 2018, section 3.3 (data-driven depth discretisation).
+
+    Example:
+        >>> import torch
+        >>> from surfconv_ops import DepthLevels
+        >>> levels = DepthLevels(edges=[2.0, 4.0], centers=[1.5, 3.0, 6.0])
+        >>> levels.assign(torch.tensor([0.0, 1.0, 2.0, 3.0, 9.0]))
+        tensor([-1,  0,  0,  1,  2])
+        >>> levels.quantize(torch.tensor([0.0, 1.0, 9.0]))
+        tensor([   nan, 1.5000, 6.0000])
+    """
+
+    edges: tuple[float, ...]
+    centers: tuple[float, ...]
+    gamma: float | None = None
+
+    def __post_init__(self) -> None:
+        edges = _ascending(self.edges, "edges")
+        centers = _ascending(self.centers, "centers")
+        if not centers:
+            raise ValueError("centers: expected at least one depth, got none")
+        if len(edges) != len(centers) - 1:
+            raise ValueError(
+                f"edges: expected {len(centers) - 1} inner boundaries for {len(centers)} centers,"
+                f" got {len(edges)}"
+            )
+        object.__setattr__(self, "edges", edges)
+        object.__setattr__(self, "centers", centers)
+        if self.gamma is not None:
+            object.__setattr__(self, "gamma", check_finite(self.gamma, "gamma"))
+
+    def __len__(self) -> int:
+        """Number of levels."""
+        return len(self.centers)
+
+    def assign(self, depth: Tensor) -> Tensor:
+        """Level of every pixel.
+
+        Args:
+            depth: Depth in metres, floating point, any shape.
+
+        Returns:
+            int64 of the same shape: 0 .. N-1, or -1 where the depth is invalid.
+
+        Raises:
+            TypeError: ``depth`` is not a floating-point tensor.
+
+        Example:
+            >>> DepthLevels([2.0], [1.0, 3.0]).assign(torch.tensor([1.0, 5.0]))
+            tensor([0, 1])
+        """
+        depth = check_depth_tensor(depth).detach()
+        # Edges are doubles: rounding them to a float32 depth's dtype could move a depth that
+        # equals an edge. Devices without float64 have no better than their own dtype.
+        wide = depth if depth.device.type == "mps" else depth.to(torch.float64)
+        edges = torch.tensor(self.edges, dtype=wide.dtype, device=wide.device)
+        level = torch.bucketize(wide, edges)
+        return torch.where(valid_depth(depth), level, -1)
+
+    def quantize(self, depth: Tensor) -> Tensor:
+        """The representative depth of every pixel's level.
+
+        Args:
+            depth: Depth in metres, floating point, any shape.
+
+        Returns:
+            Metres, of the same shape: NaN where the depth is invalid; float64 for float64 depth,
+            float32 for all others. It carries no gradient.
+
+        Raises:
+            TypeError: ``depth`` is not a floating-point tensor.
+
+        Example:
+            >>> DepthLevels([2.0], [1.0, 3.0]).quantize(torch.tensor([1.5, 5.0]))
+            tensor([1., 3.])
+        """
+        level = self.assign(depth)
+        dtype = torch.float64 if depth.dtype == torch.float64 else torch.float32
+        # Level -1 indexes the last entry, so NaN stands there.
+        table = torch.tensor((*self.centers, math.nan), dtype=dtype, device=depth.device)
+        return table[level]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Edges, centers and gamma as plain numbers and lists."""
+        return {"edges": list(self.edges), "centers": list(self.centers), "gamma": self.gamma}
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the levels to ``path`` as JSON; :meth:`load` gives back exactly the same numbers.
+
+        Args:
+            path: File to write; an existing one is replaced.
+        """
+        content = {"format": _FORMAT, "version": _VERSION, **self.to_dict()}
+        Path(path).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> DepthLevels:
+        """Levels from a file that :meth:`save` wrote.
+
+        Args:
+            path: File to read.
+
+        Returns:
+            Levels equal to those saved.
+
+        Raises:
+            ValueError: The file does not hold depth levels.
+        """
+        try:
+            content = json.loads(Path(path).read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise ValueError(f"path: {os.fspath(path)} is not JSON: {error}") from error
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
+            raise ValueError(f"path: {os.fspath(path)} does not hold depth levels")
+        if content.get("version") != _VERSION:
+            raise ValueError(
+                f"path: {os.fspath(path)} has version {content.get('version')}, expected {_VERSION}"
+            )
+        try:
+            return cls(content["edges"], content["centers"], content.get("gamma"))
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"path: {os.fspath(path)} holds no valid levels: {error}") from error
+
+
+def valid_depth(depth: Tensor) -> Tensor:
+    """Where a depth is positive and finite."""
+    return (depth > 0) & depth.isfinite()
+
+
+def _ascending(values: Any, name: str) -> tuple[float, ...]:
+    """Positive, finite, strictly ascending depths as a tuple of floats."""
+    if hasattr(values, "tolist"):
+        values = values.tolist()
+    if isinstance(values, str) or not isinstance(values, Sequence):
+        raise TypeError(f"{name}: expected a sequence of depths in metres, got {values!r}")
+    depths = tuple(check_positive(v, f"{name}[{i}]", "metres") for i, v in enumerate(values))
+    for i in range(1, len(depths)):
+        if depths[i] <= depths[i - 1]:
+            raise ValueError(
+                f"{name}: expected strictly ascending depths, got {depths[i]} after"
+                f" {depths[i - 1]} at position {i} of {list(depths)}"
+            )
+    return depths
