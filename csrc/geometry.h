@@ -56,6 +56,8 @@ struct Position {
 
 // half is 0.5 where centres lie between pixels, else 0; centre is centre_floor.
 // limit bounds the offset so that centre + offset fits in Int.
+// A sample exactly on a pixel counts to the cell it moves into as the scale grows: then the
+// derivatives of all taps are the same one-sided derivative.
 template <class T, class Int>
 inline __attribute__((always_inline)) Position<T, Int> locate(Int centre, T half, T tap, T scale,
                                                               T limit) {
@@ -63,7 +65,8 @@ inline __attribute__((always_inline)) Position<T, Int> locate(Int centre, T half
   const bool reachable = (offset < limit) & (offset > -limit);  // NaN compares false
   offset = reachable ? offset : T(0);
   Int whole = static_cast<Int>(offset);
-  whole -= static_cast<T>(whole) > offset ? 1 : 0;
+  const T floor = static_cast<T>(whole);
+  whole -= (floor > offset) | ((tap < 0) & (floor == offset)) ? 1 : 0;
   return {static_cast<Int>(centre + whole), offset - static_cast<T>(whole), reachable};
 }
 

@@ -75,7 +75,10 @@ class _Axis:
             reached = (self.scale.detach() * offset).abs() <= _REACH
             safe = torch.where(reached, self.scale, 0.0)
             position = geometry.centre_fraction(self.kernel, self.dilation) + safe * offset
-            whole = position.detach().floor()
+            # A sample on a pixel counts to the cell it moves into as the scale grows: then the
+            # derivatives of all taps are the same one-sided derivative.
+            at = position.detach()
+            whole = at.floor() if offset > 0 else at.ceil() - 1
             low = self.centre + whole.to(torch.int64)
             fraction = position - whole
         return [
