@@ -146,6 +146,28 @@ def test_precision_does_not_depend_on_place(size: tuple[int, int], layout: str) 
     problem.check_forward(surf_conv2d)
 
 
+@each_operator
+@pytest.mark.parametrize("reach", [100, 1_000, 40_000, 200_000])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_taps_that_reach_far(operator: str, reach: int, axis: int) -> None:
+    """Offsets that no 8-, 16- or 17-bit number holds still find their pixels."""
+    length = 2 * reach + 40
+    size, kernel, stride, padding = ((length, 1), (3, 1), (length // 7, 1), (1, 0))
+    if axis == 1:
+        size, kernel, stride, padding = (v[::-1] for v in (size, kernel, stride, padding))
+    problem = make_problem(
+        1, 2, 3, size, kernel, stride=stride, padding=padding, dtype=torch.float64
+    )
+    problem.scale.uniform_(-reach, reach)
+    run = OPERATORS[operator]
+    problem.check_forward(run)
+    problem.check_gradients(run)
+    # In float32 whole offsets are exact, and so the sums are as good as near taps' are.
+    single = problem.to(torch.float32)
+    single.scale.round_()
+    single.check_forward(run)
+
+
 def test_precision_far_from_the_origin() -> None:
     width = 300_000
     x = torch.zeros(1, 1, 1, width)

@@ -92,10 +92,9 @@ class BackwardTile {
 
   void pack_weights(const Executor& executor) {
     if (!needs_matrix_) return;
-    const WeightReader<T> reader(tensors_.weight, conv_.x.kernel);
     if (plan_.depthwise) {
       weights_.reset(new T[static_cast<size_t>(plan_.taps * plan_.multiplier * plan_.row)]);
-      return pack_depthwise(reader, plan_, weights_.get());
+      return pack_depthwise(tensors_.weight, conv_.x.kernel, plan_, weights_.get());
     }
     const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
     const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
@@ -104,7 +103,8 @@ class BackwardTile {
     run_tasks(
         executor, tasks, workers_for(executor, tasks, tasks * stride_), [&](int, int64_t task) {
           const int64_t first_tap = task % tap_blocks * taps_;
-          pack_backward(reader, plan_, blocks_[static_cast<size_t>(task / tap_blocks)], first_tap,
+          pack_backward(tensors_.weight, conv_.x.kernel, plan_,
+                        blocks_[static_cast<size_t>(task / tap_blocks)], first_tap,
                         std::min(taps_, plan_.taps - first_tap), weights_.get() + task * stride_);
         });
   }

@@ -44,47 +44,27 @@ SURFCONV_INLINE int64_t taps_at_once(int64_t taps, int64_t channels) {
   return std::max<int64_t>(1, std::min({taps, kMostTaps, kDepth / std::max<int64_t>(channels, 1)}));
 }
 
-// One tap of one input channel against all outputs, in the compute type whatever is stored.
-template <class T>
-class WeightReader {
- public:
-  WeightReader(const View& view, int64_t kernel_x) : view_(view), kernel_x_(kernel_x) {}
-
-  // to[i] = weight[first_output + i, channel, tap]
-  void outputs(int64_t first_output, int64_t count, int64_t channel, int64_t tap, T* to) const {
-    const int64_t origin = first_output * view_.n + channel * view_.c + tap / kernel_x_ * view_.y +
-                           tap % kernel_x_ * view_.x;
-    visit_storage<T>(view_, [&](auto* data) {
-      for (int64_t i = 0; i < count; ++i) to[i] = widen(data[origin + i * view_.n]);
-    });
-  }
-  // to[i] = weight[output, first_channel + i, tap]
-  void channels(int64_t output, int64_t first_channel, int64_t count, int64_t tap, T* to) const {
-    const int64_t origin = output * view_.n + first_channel * view_.c + tap / kernel_x_ * view_.y +
-                           tap % kernel_x_ * view_.x;
-    visit_storage<T>(view_, [&](auto* data) {
-      for (int64_t i = 0; i < count; ++i) to[i] = widen(data[origin + i * view_.c]);
-    });
-  }
-
- private:
-  View view_;
-  int64_t kernel_x_;
-};
+// Weights are packed by the loads of pixels: the kernel's taps are the pixels of a small image.
 
 // Rows (tap, channel) of a block against its group's outputs, in panels: the forward's B.
 template <class T>
-void pack_forward(const WeightReader<T>& weight, const Plan& plan, const ChannelBlock& block,
+void pack_forward(const View& weight, int64_t kernel_x, const Plan& plan, const ChannelBlock& block,
                   int64_t first_tap, int64_t taps, T* packed) {
   const int64_t depth = taps * block.padded;
   for_panels<T>(plan.outputs, [&](int64_t column, int64_t columns, bool) {
     T* panel = packed + column * depth;
     const int64_t used = std::min(columns, plan.outputs - column);
-    std::fill(panel, panel + depth * columns, T(0));
-    for (int64_t t = 0; t < taps; ++t) {
-      for (int64_t c = 0; c < block.count; ++c) {
-        weight.outputs(block.group * plan.outputs + column, used, block.first + c, first_tap + t,
-                       panel + (t * block.padded + c) * columns);
+    for (int64_t c = 0; c < block.padded; ++c) {
+      if (c < block.count) {
+        View filter = weight;
+        advance(filter, (block.first + c) * weight.c);
+        filter.c = weight.n;
+        load_pixels<T>(filter, 0, block.group * plan.outputs + column, used, kernel_x, first_tap,
+                       taps, panel + c * columns, block.padded * columns, columns);
+      } else {
+        for (int64_t t = 0; t < taps; ++t) {
+          std::fill_n(panel + (t * block.padded + c) * columns, columns, T(0));
+        }
       }
     }
   });
@@ -92,37 +72,28 @@ void pack_forward(const WeightReader<T>& weight, const Plan& plan, const Channel
 
 // Rows of outputs against (tap, channel), in panels: the B of the gradient of the gathered matrix.
 template <class T>
-void pack_backward(const WeightReader<T>& weight, const Plan& plan, const ChannelBlock& block,
-                   int64_t first_tap, int64_t taps, T* packed) {
-  const int64_t width = taps * block.padded, depth = plan.outputs;
-  for_panels<T>(width, [&](int64_t column, int64_t columns, bool) {
-    T* panel = packed + column * depth;
-    std::fill(panel, panel + depth * columns, T(0));
-    for (int64_t o = 0; o < depth; ++o) {
-      // Panels cut across taps only at quads, so a run of one tap's channels starts at a quad.
-      for (int64_t at = column; at < std::min(column + columns, width);) {
-        const int64_t t = at / block.padded, c = at % block.padded;
-        const int64_t span = std::min(block.padded - c, column + columns - at);
-        const int64_t used = std::min(span, std::max<int64_t>(block.count - c, 0));
-        weight.channels(block.group * plan.outputs + o, block.first + c, used, first_tap + t,
-                        panel + o * columns + (at - column));
-        at += span;
-      }
-    }
-  });
+void pack_backward(const View& weight, int64_t kernel_x, const Plan& plan,
+                   const ChannelBlock& block, int64_t first_tap, int64_t taps, T* packed) {
+  const int64_t width = taps * block.padded;
+  std::vector<T> row(static_cast<size_t>(pad_width<T>(width)), T(0));
+  for (int64_t o = 0; o < plan.outputs; ++o) {
+    load_pixels<T>(weight, block.group * plan.outputs + o, block.first, block.count, kernel_x,
+                   first_tap, taps, row.data(), block.padded, block.padded);
+    for_panels<T>(width, [&](int64_t column, int64_t columns, bool) {
+      std::copy_n(row.data() + column, columns, packed + column * plan.outputs + o * columns);
+    });
+  }
 }
 
 // Depthwise weights as [tap][multiplier][row].
 template <class T>
-void pack_depthwise(const WeightReader<T>& weight, const Plan& plan, T* packed) {
-  std::fill(packed, packed + plan.taps * plan.multiplier * plan.row, T(0));
-  for (int64_t t = 0; t < plan.taps; ++t) {
-    for (int64_t j = 0; j < plan.multiplier; ++j) {
-      for (int64_t c = 0; c < plan.channels; ++c) {
-        weight.outputs(c * plan.multiplier + j, 1, 0, t,
-                       packed + (t * plan.multiplier + j) * plan.row + c);
-      }
-    }
+void pack_depthwise(const View& weight, int64_t kernel_x, const Plan& plan, T* packed) {
+  for (int64_t j = 0; j < plan.multiplier; ++j) {
+    View filter = weight;
+    advance(filter, j * weight.n);
+    filter.c = weight.n * plan.multiplier;
+    load_pixels<T>(filter, 0, 0, plan.channels, kernel_x, 0, plan.taps, packed + j * plan.row,
+                   plan.multiplier * plan.row, plan.row);
   }
 }
 
@@ -141,7 +112,7 @@ struct InputRows {
   std::unique_ptr<T[]> memory;
 
   InputRows(const Conv& conv, const Plan& plan, const View& input, int64_t images) {
-    const bool same = input.dtype == (sizeof(T) == 8 ? DType::f64 : DType::f32);
+    const bool same = input.dtype == kComputeDType<T>;
     const bool quads = plan.row == conv.in_channels;
     packed = !(same && quads && input.c == 1);
     if (packed) memory.reset(new T[static_cast<size_t>(images * conv.y.in * conv.x.in * plan.row)]);

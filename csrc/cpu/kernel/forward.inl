@@ -15,6 +15,9 @@ class Forward {
         ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
         input_(conv, plan_, tensors.input, images_),
         guide_(conv, tensors.guide, images_),
+        writes_rows_(!plan_.depthwise && plan_.outputs % kLanes<T> == 0 &&
+                     tensors.output.dtype == kComputeDType<T> && tensors.output.c == 1 &&
+                     tensors.output.y == tensors.output.x * conv.x.out),
         unseen_(static_cast<size_t>(plan_.row + kLanes<T>), T(0)) {
     pack_weights();
   }
@@ -63,7 +66,6 @@ class Forward {
   }
 
   void pack_weights() {
-    const WeightReader<T> reader(tensors_.weight, conv_.x.kernel);
     const int64_t depth = plan_.taps * plan_.row;
     weights_.reset(
         new T[static_cast<size_t>(depth * (plan_.depthwise ? plan_.multiplier : width_))]);
@@ -79,7 +81,8 @@ class Forward {
         }
       });
     }
-    if (plan_.depthwise) return pack_depthwise(reader, plan_, weights_.get());
+    if (plan_.depthwise)
+      return pack_depthwise(tensors_.weight, conv_.x.kernel, plan_, weights_.get());
     const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
     const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
     run_tasks(executor_, tasks, workers_for(executor_, tasks, depth * width_),
@@ -87,7 +90,8 @@ class Forward {
                 const ChannelBlock& block = blocks_[static_cast<size_t>(task / tap_blocks)];
                 const int64_t first_tap = task % tap_blocks * taps_;
                 const int64_t taps = std::min(taps_, plan_.taps - first_tap);
-                pack_forward(reader, plan_, block, first_tap, taps, packed(block, first_tap, taps));
+                pack_forward(tensors_.weight, conv_.x.kernel, plan_, block, first_tap, taps,
+                             packed(block, first_tap, taps));
               });
   }
 
@@ -100,7 +104,13 @@ class Forward {
     const AxisSteps steps_x{input_.step_x(plan_, tensors_.input) * bytes, 0, 1};
     scratch.tile.place(tensors_.scale, guide_.image(conv_, tensors_.guide, first_image, n), n,
                        begin, count, steps_y, steps_x);
-    const int64_t ld_out = plan_.groups * width_;
+    // Straight into the output where whole blocks of the product fit there.
+    const bool direct = writes_rows_ && count % kRowPad == 0;
+    const int64_t ld_out = direct ? tensors_.output.x : plan_.groups * width_;
+    T* out = direct ? static_cast<T*>(tensors_.output.data) + n * tensors_.output.n +
+                          begin * tensors_.output.x
+                    : scratch.out;
+    const int64_t group_step = direct ? plan_.outputs : width_;
     if (plan_.depthwise) {
       for (int m = 0; m < count; ++m) {
         std::memcpy(scratch.out + m * ld_out, initial_.data(), static_cast<size_t>(ld_out * bytes));
@@ -123,12 +133,12 @@ class Forward {
         } else {
           const bool first = first_tap == 0 && block.first == 0;
           gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded, scratch.rows,
-                         ld_rows_, packed(block, first_tap, taps),
-                         scratch.out + block.group * width_, ld_out,
-                         first ? initial_.data() + block.group * width_ : nullptr);
+                         ld_rows_, packed(block, first_tap, taps), out + block.group * group_step,
+                         ld_out, first ? initial_.data() + block.group * width_ : nullptr);
         }
       }
     }
+    if (direct) return;
     if (plan_.depthwise) {
       View output = tensors_.output;
       output.c *= plan_.multiplier;
@@ -155,6 +165,7 @@ class Forward {
   const int64_t taps_, width_, ld_rows_;
   InputRows<T> input_;
   GuideRows<T> guide_;
+  const bool writes_rows_;
   std::vector<T> unseen_;  // what a corner outside the image reads
   std::vector<T> initial_;
   std::unique_ptr<T[]> weights_;

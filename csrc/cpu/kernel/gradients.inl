@@ -19,7 +19,7 @@ class Backward {
     }
     if (scatters()) {
       const View& to = tensors_.grad_input;
-      const bool same = to.dtype == (sizeof(T) == 8 ? DType::f64 : DType::f32);
+      const bool same = to.dtype == kComputeDType<T>;
       in_place_ = same && to.c == 1 && plan.row == conv.in_channels;
       if (!in_place_) grad_input_.reset(new T[static_cast<size_t>(images_ * image_elements())]);
     }

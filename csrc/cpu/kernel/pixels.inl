@@ -48,6 +48,9 @@ SURFCONV_INLINE void narrow(float value, Float16* to) {
   to->bits = static_cast<uint16_t>(magnitude | sign >> 16);
 }
 
+template <class T>
+constexpr DType kComputeDType = sizeof(T) == 8 ? DType::f64 : DType::f32;
+
 // body(pointer of the storage type); float16 types never meet double arithmetic.
 template <class T, class Body>
 SURFCONV_INLINE void visit_storage(const View& view, const Body& body) {

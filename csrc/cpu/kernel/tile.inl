@@ -6,7 +6,7 @@ struct GuideRows {
 
   GuideRows(const Conv& conv, const View& guide, int64_t images) : given(guide.data != nullptr) {
     if (!given) return;
-    const bool same = guide.dtype == (sizeof(T) == 8 ? DType::f64 : DType::f32);
+    const bool same = guide.dtype == kComputeDType<T>;
     packed = !(same && guide.x == 1 && guide.y == conv.x.in);
     if (packed) memory.reset(new T[static_cast<size_t>(images * conv.y.in * conv.x.in)]);
   }
