@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from numbers import Real
 from typing import Any, Literal
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from .geometry import FloatPair, Pair
 
@@ -109,3 +109,24 @@ def check_depth_tensor(depth: Any, name: str = "depth") -> Tensor:
 def type_name(value: Any) -> str:
     """Name of a value's type, for messages."""
     return type(value).__name__
+
+
+def check_shareable_conv2d(conv: Any, surf_conv2d: type[nn.Conv2d]) -> None:
+    """An nn.Conv2d, or the layer made from one, whose Parameters another layer can share."""
+    if not isinstance(conv, nn.Conv2d):
+        raise TypeError(f"conv: expected nn.Conv2d, got {type_name(conv)}")
+    if isinstance(conv, nn.LazyConv2d):
+        raise ValueError(
+            "conv: expected nn.Conv2d with its weights made, got LazyConv2d before its first"
+            " forward; run it once first"
+        )
+    if type(conv) is not nn.Conv2d and not isinstance(conv, surf_conv2d):
+        raise TypeError(
+            f"conv: expected nn.Conv2d itself, got the subclass {type_name(conv)}, whose"
+            " forward may do more than convolve"
+        )
+    if not isinstance(conv.weight, nn.Parameter):
+        raise ValueError(
+            "conv: expected a weight that is a Parameter, got one that is computed (as by"
+            " weight_norm), which cannot be shared"
+        )

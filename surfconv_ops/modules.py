@@ -15,7 +15,7 @@ from .checks import (
     PairArgument,
     check_pair,
     check_positive_pair,
-    type_name,
+    check_shareable_conv2d,
 )
 from .depth_layer import DepthLayer, check_depth_options
 from .functional import surf_conv2d
@@ -166,7 +166,7 @@ class SurfConv2d(DepthLayer, nn.Conv2d):
             >>> SurfConv2d.from_conv2d(conv, reference_depth=2.0).weight is conv.weight
             True
         """
-        _check_convertible(conv)
+        check_shareable_conv2d(conv, SurfConv2d)
         layer = cls(
             conv.in_channels,
             conv.out_channels,
@@ -301,26 +301,6 @@ class SurfConv2d(DepthLayer, nn.Conv2d):
             padding=self.padding,  # type: ignore[arg-type]
             dilation=self.dilation,
             groups=self.groups,
-        )
-
-
-def _check_convertible(conv: Any) -> None:
-    if not isinstance(conv, nn.Conv2d):
-        raise TypeError(f"conv: expected nn.Conv2d, got {type_name(conv)}")
-    if isinstance(conv, nn.LazyConv2d):
-        raise ValueError(
-            "conv: expected nn.Conv2d with its weights made, got LazyConv2d before its first"
-            " forward; run it once first"
-        )
-    if type(conv) is not nn.Conv2d and not isinstance(conv, SurfConv2d):
-        raise TypeError(
-            f"conv: expected nn.Conv2d itself, got the subclass {type_name(conv)}, whose"
-            " forward may do more than convolve"
-        )
-    if not isinstance(conv.weight, nn.Parameter):
-        raise ValueError(
-            "conv: expected a weight that is a Parameter, got one that is computed (as by"
-            " weight_norm), which cannot be shared"
         )
 
 

@@ -170,7 +170,7 @@ class BackwardTile {
   }
 
  private:
-  static constexpr int64_t kBlock = 32;
+  static constexpr int64_t kBlock = 64;
 
   int64_t most_groups() const {
     int64_t most = 1;
