@@ -57,8 +57,8 @@ struct Position {
 // half is 0.5 where centres lie between pixels, else 0; centre is centre_floor.
 // limit bounds the offset so that centre + offset fits in Int.
 // A sample exactly on a pixel counts to the cell it moves into as the scale grows: then the
-// derivatives of all taps are the same one-sided derivative.
-template <class T, class Int>
+// derivatives of all taps are the same one-sided derivative. Descending: the tap is negative.
+template <bool Descending, class T, class Int>
 inline __attribute__((always_inline)) Position<T, Int> locate(Int centre, T half, T tap, T scale,
                                                               T limit) {
   T offset = half + scale * tap;
@@ -66,7 +66,7 @@ inline __attribute__((always_inline)) Position<T, Int> locate(Int centre, T half
   offset = reachable ? offset : T(0);
   Int whole = static_cast<Int>(offset);
   const T floor = static_cast<T>(whole);
-  whole -= (floor > offset) | ((tap < 0) & (floor == offset)) ? 1 : 0;
+  whole -= (Descending ? floor >= offset : floor > offset) ? 1 : 0;
   return {static_cast<Int>(centre + whole), offset - static_cast<T>(whole), reachable};
 }
 

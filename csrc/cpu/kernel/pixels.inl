@@ -170,7 +170,9 @@ void load_pixels(const View& view, int64_t n, int64_t first_channel, int64_t cha
     for_runs(view, width, first, count, [&](int64_t done, int64_t run, int64_t offset) {
       const S* from = origin + offset;
       T* rows = to + done * ld;
-      if (view.c != 1 && view.x == 1) {
+      if (channels == 1 && ld == 1) {
+        for (int64_t p = 0; p < run; ++p) rows[p] = widen(from[p * view.x]);
+      } else if (view.c != 1 && view.x == 1) {
         if constexpr (std::is_same_v<S, T>) {
           transpose(from, view.c, channels, run, rows, ld);
         } else {

@@ -1,4 +1,6 @@
 // Where the taps of one tile of output pixels fall, and what each corner weighs.
+// Loops over a tile always run to its full length, a number the compiler knows; entries beyond the
+// tile's pixels hold the geometry of a scale of zero and are not used.
 constexpr int kTile = 48;
 
 // Per axis, tap and side (pixel `lo`, then `lo + 1`), one entry for each pixel of the tile.
@@ -31,25 +33,43 @@ struct AxisSteps {
 
 // (lo + side) * step; a step of 32 bits lets a narrow Int use the widening multiply.
 template <class Int>
-SURFCONV_INLINE void fill_offsets(const Int* __restrict lo, int count, int sides, int64_t step,
+SURFCONV_INLINE void fill_offsets(const Int* __restrict lo, int sides, int64_t step,
                                   int64_t* __restrict to) {
   if (sizeof(Int) == 4 && step == static_cast<int32_t>(step)) {
     const int32_t narrow_step = static_cast<int32_t>(step);
-    for (int m = 0; m < count; ++m) to[m] = static_cast<int64_t>(lo[m]) * narrow_step;
+    for (int m = 0; m < kTile; ++m) to[m] = static_cast<int64_t>(lo[m]) * narrow_step;
   } else {
-    for (int m = 0; m < count; ++m) to[m] = static_cast<int64_t>(lo[m]) * step;
+    for (int m = 0; m < kTile; ++m) to[m] = static_cast<int64_t>(lo[m]) * step;
   }
   if (sides == 2) {
-    for (int m = 0; m < count; ++m) to[kTile + m] = to[m] + step;
+    for (int m = 0; m < kTile; ++m) to[kTile + m] = to[m] + step;
+  }
+}
+
+// One tap of all pixels: the lower pixel, then weight and presence of both.
+template <bool Descending, class T, class Int>
+void locate_tile(T half, T tap, Int size, const T* __restrict scale, const Int* __restrict centre,
+                 Int* __restrict lo, T* __restrict weight, T* __restrict inside) {
+  const T limit = static_cast<T>(int64_t{1} << (sizeof(Int) == 4 ? 29 : 61));
+  for (int m = 0; m < kTile; ++m) {
+    const auto position = locate<Descending, T, Int>(centre[m], half, tap, scale[m], limit);
+    const bool in_lo = position.reachable & (position.lo >= 0) & (position.lo < size);
+    const bool in_hi = position.reachable & (position.lo >= -1) & (position.lo < size - 1);
+    lo[m] = position.lo;
+    inside[m] = in_lo ? T(1) : T(0);
+    inside[kTile + m] = in_hi ? T(1) : T(0);
+    weight[m] = in_lo ? 1 - position.fraction : T(0);
+    weight[kTile + m] = in_hi ? position.fraction : T(0);
   }
 }
 
 template <class T, class Int>
-void fill_axis(const Axis& axis, const AxisSteps& steps, int count, const T* __restrict scale,
-               const int64_t* __restrict centre, const AxisTable<T>& table) {
+void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict scale,
+               const int64_t* __restrict wide_centre, const AxisTable<T>& table) {
   const T half = axis.centre_is_half() ? T(0.5) : T(0);
-  const T limit = static_cast<T>(int64_t{1} << (sizeof(Int) == 4 ? 29 : 61));
   const Int size = static_cast<Int>(axis.in);
+  Int centre[kTile];
+  for (int m = 0; m < kTile; ++m) centre[m] = static_cast<Int>(wide_centre[m]);
   for (int64_t t = 0; t < axis.kernel; ++t) {
     const T tap = static_cast<T>(axis.tap_doubled(t)) / 2;
     const int64_t at = t * 2 * kTile;
@@ -57,37 +77,29 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, int count, const T* __r
     T* __restrict weight = table.weight + at;
     T* __restrict inside = table.inside + at;
     if (axis.fixed(t)) {
-      for (int m = 0; m < count; ++m) {
-        const bool in = (centre[m] >= 0) & (centre[m] < axis.in);
-        lo[m] = in ? static_cast<Int>(centre[m]) : 0;
+      for (int m = 0; m < kTile; ++m) {
+        const bool in = (centre[m] >= 0) & (centre[m] < size);
+        lo[m] = in ? centre[m] : 0;
         weight[m] = inside[m] = in ? T(1) : T(0);
       }
+    } else if (tap < 0) {
+      locate_tile<true>(half, tap, size, scale, centre, lo, weight, inside);
     } else {
-      for (int m = 0; m < count; ++m) {
-        const auto position =
-            locate<T, Int>(static_cast<Int>(centre[m]), half, tap, scale[m], limit);
-        const bool in_lo = position.reachable & (position.lo >= 0) & (position.lo < size);
-        const bool in_hi = position.reachable & (position.lo >= -1) & (position.lo < size - 1);
-        lo[m] = position.lo;
-        inside[m] = in_lo ? T(1) : T(0);
-        inside[kTile + m] = in_hi ? T(1) : T(0);
-        weight[m] = in_lo ? 1 - position.fraction : T(0);
-        weight[kTile + m] = in_hi ? position.fraction : T(0);
-      }
+      locate_tile<false>(half, tap, size, scale, centre, lo, weight, inside);
     }
     const int sides = axis.fixed(t) ? 1 : 2;
-    fill_offsets(lo, count, sides, steps.read, table.read + at);
-    if (steps.pixel != 0) fill_offsets(lo, count, sides, steps.pixel, table.pixel + at);
+    fill_offsets(lo, sides, steps.read, table.read + at);
+    if (steps.pixel != 0) fill_offsets(lo, sides, steps.pixel, table.pixel + at);
     if (steps.write_rows != nullptr) {
       for (int side = 0; side < sides; ++side) {
-        for (int m = 0; m < count; ++m) {
+        for (int m = 0; m < kTile; ++m) {
           const bool in = inside[side * kTile + m] != 0;
           table.write[at + side * kTile + m] =
               in ? steps.write_rows[static_cast<int64_t>(lo[m]) + side] : 0;
         }
       }
     } else if (steps.write != 0) {
-      fill_offsets(lo, count, sides, steps.write, table.write + at);
+      fill_offsets(lo, sides, steps.write, table.write + at);
     }
   }
 }
@@ -97,8 +109,8 @@ template <class T>
 struct GuideTile {
   const T* image = nullptr;  // the whole image's guide, pixel by pixel; null: no guide
   T tolerance = 0;
-  T centre[kTile];
-  T exempt[kTile];  // 1 where the centre's own value is not finite: all corners are visible
+  T centre[kTile] = {};
+  T exempt[kTile] = {};  // 1 where the centre's own value is not finite: all corners are visible
 };
 
 // Corners of one tap: 1, 2 or 4 of them, [corner][kTile]. A corner of zero weight is never seen:
@@ -148,7 +160,7 @@ enum class Slopes { none, one, two };
 
 // ty, tx: the tap's place in the kernel; unseen_read, unseen_write: where unseen corners point.
 template <class T, bool Guided, bool Writes, Slopes S>
-void fill_corners(const Conv& conv, int64_t ty, int64_t tx, int count, const AxisTable<T>& rows,
+void fill_corners(const Conv& conv, int64_t ty, int64_t tx, const AxisTable<T>& rows,
                   const AxisTable<T>& columns, const GuideTile<T>& guide, int64_t unseen_read,
                   int64_t unseen_write, TapCorners<T>& tap) {
   const int sides_y = conv.y.fixed(ty) ? 1 : 2, sides_x = conv.x.fixed(tx) ? 1 : 2;
@@ -170,18 +182,18 @@ void fill_corners(const Conv& conv, int64_t ty, int64_t tx, int count, const Axi
         const int64_t* __restrict pixel_y = rows.pixel + at_y;
         const int64_t* __restrict pixel_x = columns.pixel + at_x;
         int64_t pixel[kTile];
-        for (int m = 0; m < count; ++m) {
+        for (int m = 0; m < kTile; ++m) {
           const bool in = (inside_y[m] != 0) & (inside_x[m] != 0);
           pixel[m] = in ? pixel_y[m] + pixel_x[m] : 0;
         }
         T value[kTile];
-        for (int m = 0; m < count; ++m) value[m] = guide.image[pixel[m]];
-        for (int m = 0; m < count; ++m) {
+        for (int m = 0; m < kTile; ++m) value[m] = guide.image[pixel[m]];
+        for (int m = 0; m < kTile; ++m) {
           const T distance = std::fabs(value[m] - guide.centre[m]);
           visible[m] = distance <= guide.tolerance ? T(1) : guide.exempt[m];
         }
       }
-      for (int m = 0; m < count; ++m) {
+      for (int m = 0; m < kTile; ++m) {
         weight[m] = weight_y[m] * weight_x[m];
         if constexpr (Guided) weight[m] *= visible[m];
       }
@@ -189,14 +201,14 @@ void fill_corners(const Conv& conv, int64_t ty, int64_t tx, int count, const Axi
       const int64_t* __restrict read_x = columns.read + at_x;
       int64_t* __restrict read = tap.read + corner;
       if constexpr (S == Slopes::none) {
-        for (int m = 0; m < count; ++m)
+        for (int m = 0; m < kTile; ++m)
           read[m] = weight[m] != 0 ? read_y[m] + read_x[m] : unseen_read;
       } else {
         const T sign_y = sides_y == 1 ? T(0) : (i == 0 ? -tap_y : tap_y);
         const T sign_x = sides_x == 1 ? T(0) : (j == 0 ? -tap_x : tap_x);
         T* __restrict slope = tap.slope + corner;
         T* __restrict slope_x = tap.slope_x + corner;
-        for (int m = 0; m < count; ++m) {
+        for (int m = 0; m < kTile; ++m) {
           T along_y = sign_y * inside_y[m] * weight_x[m];
           T along_x = sign_x * weight_y[m] * inside_x[m];
           if constexpr (Guided) {
@@ -215,7 +227,7 @@ void fill_corners(const Conv& conv, int64_t ty, int64_t tx, int count, const Axi
         const int64_t* __restrict write_y = rows.write + at_y;
         const int64_t* __restrict write_x = columns.write + at_x;
         int64_t* __restrict write = tap.write + corner;
-        for (int m = 0; m < count; ++m) {
+        for (int m = 0; m < kTile; ++m) {
           write[m] = weight[m] != 0 ? write_y[m] + write_x[m] : unseen_write;
         }
       }

@@ -48,14 +48,14 @@ class Tile {
              AxisSteps steps_y, AxisSteps steps_x) {
     count_ = count;
     if (guide == nullptr) steps_y.pixel = steps_x.pixel = 0;
-    T scale_y[kTile], scale_x_own[kTile];
+    T scale_y[kTile] = {}, scale_x_own[kTile] = {};
     load_pixels<T>(scale, n, 0, 1, conv_.x.out, first, count, scale_y, 1, 1);
     const T* scale_x = scale_y;
     if (conv_.scale_components == 2) {
       load_pixels<T>(scale, n, 1, 1, conv_.x.out, first, count, scale_x_own, 1, 1);
       scale_x = scale_x_own;
     }
-    int64_t centre_y[kTile], centre_x[kTile];
+    int64_t centre_y[kTile] = {}, centre_x[kTile] = {};
     guide_.image = guide;
     guide_.tolerance = static_cast<T>(conv_.guide_tolerance);
     int64_t y = first / conv_.x.out, x = first % conv_.x.out;
@@ -74,8 +74,8 @@ class Tile {
     }
     const auto fill = [&](auto index) {
       using Int = decltype(index);
-      fill_axis<T, Int>(conv_.y, steps_y, count, scale_y, centre_y, rows_);
-      fill_axis<T, Int>(conv_.x, steps_x, count, scale_x, centre_x, columns_);
+      fill_axis<T, Int>(conv_.y, steps_y, scale_y, centre_y, rows_);
+      fill_axis<T, Int>(conv_.x, steps_x, scale_x, centre_x, columns_);
     };
     narrow_ ? fill(int32_t{}) : fill(int64_t{});
   }
@@ -86,10 +86,10 @@ class Tile {
       const int64_t ty = (first_tap + t) / conv_.x.kernel, tx = (first_tap + t) % conv_.x.kernel;
       TapCorners<T>& corners = corners_.taps[static_cast<size_t>(t)];
       if (guide_.image != nullptr) {
-        fill_corners<T, true, Writes, S>(conv_, ty, tx, count_, rows_, columns_, guide_,
+        fill_corners<T, true, Writes, S>(conv_, ty, tx, rows_, columns_, guide_,
                                          unseen_read, unseen_write, corners);
       } else {
-        fill_corners<T, false, Writes, S>(conv_, ty, tx, count_, rows_, columns_, guide_,
+        fill_corners<T, false, Writes, S>(conv_, ty, tx, rows_, columns_, guide_,
                                           unseen_read, unseen_write, corners);
       }
     }
