@@ -8,11 +8,13 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "tile.inl"
 #include "gemm.inl"
 #include "blocks.inl"
+#include "passes.inl"
 #include "depthwise.inl"
 #include "gather.inl"
 #include "scatter.inl"
 #include "forward.inl"
 #include "bands.inl"
+#include "gradient_rows.inl"
 #include "backward.inl"
 #include "gradients.inl"
 

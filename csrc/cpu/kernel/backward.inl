@@ -37,7 +37,8 @@ class BackwardTile {
     char* grad_input;   // image, as bytes; null: not needed
     T* weight;          // partials of the unit's blocks, one after the other
     T* bias;            // partial of all outputs, each added by its group's first block
-    T* scale;           // partial of the image [components][pixels]
+    T* scale;           // partial of the pass' pixels of the image, [components][pixels]
+    int64_t first_pixel, pixels;
   };
 
   BackwardTile(const Conv& conv, const BackwardTensors& tensors)
@@ -159,10 +160,9 @@ class BackwardTile {
       });
     }
     if (target.scale != nullptr) {
-      const int64_t pixels = conv_.y.out * conv_.x.out;
       for (int64_t k = 0; k < conv_.scale_components; ++k) {
         for (int m = 0; m < count; ++m) {
-          target.scale[k * pixels + begin + m] =
+          target.scale[k * target.pixels + begin - target.first_pixel + m] =
               sum_lanes<T>(load<Vec<T, kLanes<T>>>(scratch.dot + (k * kTile + m) * kLanes<T>));
         }
       }

@@ -8,13 +8,12 @@ class Forward {
         tensors_(tensors),
         executor_(executor),
         plan_(conv),
-        images_(images_at_once(conv, plan_)),
         blocks_(channel_blocks(plan_, kBlock)),
         taps_(taps_at_once(plan_.taps, std::min(kBlock, to_quads(plan_.channels)))),
         width_(plan_.depthwise ? plan_.multiplier * plan_.row : pad_width<T>(plan_.outputs)),
         ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
-        input_(conv, plan_, tensors.input, images_),
-        guide_(conv, tensors.guide, images_),
+        input_(conv, plan_, tensors.input),
+        guide_(conv, tensors.guide),
         writes_rows_(!plan_.depthwise && plan_.outputs % kLanes<T> == 0 &&
                      tensors.output.dtype == kComputeDType<T> && tensors.output.c == 1 &&
                      tensors.output.y == tensors.output.x * conv.x.out),
@@ -23,12 +22,14 @@ class Forward {
   }
 
   void run() {
-    const int64_t pixels = conv_.y.out * conv_.x.out, tiles = (pixels + kTile - 1) / kTile;
-    const int64_t tasks = images_ * tiles;
-    const int workers = workers_for(
-        executor_, tasks, images_ * pixels * plan_.taps * plan_.channels * conv_.out_channels);
-    const int64_t need = Tile<T>::need(conv_, taps_) +
-                         Workspace::need<T>(round_up(kTile, kRowPad) * ld_rows_) +
+    const std::vector<Pass> passes =
+        make_passes<T>(conv_, tensors_.scale, input_.packed(), input_.row_elements());
+    input_.reserve(passes);
+    const int64_t work = conv_.x.out * plan_.taps * plan_.channels * conv_.out_channels;
+    const int64_t most_tiles = (conv_.y.out * conv_.x.out + kTile - 1) / kTile;
+    const int workers =
+        workers_for(executor_, passes[0].images * most_tiles, conv_.y.out * conv_.batch * work);
+    const int64_t need = Tile<T>::need(conv_, taps_) + Workspace::need<T>(kTile * ld_rows_) +
                          Workspace::need<T>(kTile * plan_.groups * width_);
     Workspace memory(workers * need);
     std::vector<Scratch> scratch;
@@ -37,14 +38,15 @@ class Forward {
       scratch.push_back({Tile<T>(conv_, taps_, memory), memory.take<T>(kTile * ld_rows_),
                          memory.take<T>(kTile * plan_.groups * width_)});
     }
-    for (int64_t first = 0; first < conv_.batch; first += images_) {
-      const int64_t images = std::min(images_, conv_.batch - first);
-      input_.pack(conv_, plan_, tensors_.input, first, images, executor_);
-      guide_.pack(conv_, tensors_.guide, first, images);
-      run_tasks(executor_, images * tiles, workers, [&](int worker, int64_t task) {
-        const int64_t begin = task % tiles * kTile;
-        tile(scratch[static_cast<size_t>(worker)], first, first + task / tiles, begin,
-             static_cast<int>(std::min<int64_t>(kTile, pixels - begin)));
+    for (const Pass& pass : passes) {
+      input_.pack(pass, executor_);
+      guide_.pack(pass);
+      const int64_t first = pass.out.begin * conv_.x.out;
+      const int64_t pixels = pass.out.count() * conv_.x.out, tiles = (pixels + kTile - 1) / kTile;
+      run_tasks(executor_, pass.images * tiles, workers, [&](int worker, int64_t task) {
+        const int64_t done = task % tiles * kTile;
+        tile(scratch[static_cast<size_t>(worker)], pass, pass.first_image + task / tiles,
+             first + done, static_cast<int>(std::min<int64_t>(kTile, pixels - done)));
       });
     }
   }
@@ -95,15 +97,13 @@ class Forward {
               });
   }
 
-  void tile(Scratch& scratch, int64_t first_image, int64_t n, int64_t begin, int count) {
+  void tile(Scratch& scratch, const Pass& pass, int64_t n, int64_t begin, int count) {
     constexpr int64_t bytes = sizeof(T);
-    const T* image = input_.image(conv_, plan_, tensors_.input, first_image, n);
-    const char* base = reinterpret_cast<const char*>(image);
+    const char* base = input_.image(pass, n);
     const int64_t unseen = byte_distance(base, unseen_.data());
-    const AxisSteps steps_y{input_.step_y(conv_, plan_, tensors_.input) * bytes, 0, conv_.x.in};
-    const AxisSteps steps_x{input_.step_x(plan_, tensors_.input) * bytes, 0, 1};
-    scratch.tile.place(tensors_.scale, guide_.image(conv_, tensors_.guide, first_image, n), n,
-                       begin, count, steps_y, steps_x);
+    const AxisSteps steps_y{input_.step_y() * bytes, 0, conv_.x.in};
+    const AxisSteps steps_x{input_.step_x() * bytes, 0, 1};
+    scratch.tile.place(tensors_.scale, guide_.image(pass, n), n, begin, count, steps_y, steps_x);
     // Straight into the output where whole blocks of the product fit there.
     const bool direct = writes_rows_ && count % kRowPad == 0;
     const int64_t ld_out = direct ? tensors_.output.x : plan_.groups * width_;
@@ -160,7 +160,6 @@ class Forward {
   const ForwardTensors& tensors_;
   const Executor& executor_;
   const Plan plan_;
-  const int64_t images_;
   const std::vector<ChannelBlock> blocks_;
   const int64_t taps_, width_, ld_rows_;
   InputRows<T> input_;

@@ -7,104 +7,105 @@ class Backward {
         tensors_(tensors),
         executor_(executor),
         tile_(conv, tensors),
-        images_(images_at_once(conv, tile_.plan())),
         slots_wanted_(std::max<int64_t>(1, kTasks / units())),
-        input_(conv, tile_.plan(), tensors.input, images_),
-        guide_(conv, tensors.guide, images_) {
-    const Plan& plan = tile_.plan();
+        input_(conv, tile_.plan(), tensors.input),
+        guide_(conv, tensors.guide),
+        grad_input_(conv, tile_.plan(), tensors.grad_input) {
     tile_.pack_weights(executor);
     for (const Unit& unit : tile_.units()) {
       weight_offset_.push_back(weight_elements_);
       weight_elements_ += tile_.weight_elements(unit);
     }
-    if (scatters()) {
-      const View& to = tensors_.grad_input;
-      const bool same = to.dtype == kComputeDType<T>;
-      in_place_ = same && to.c == 1 && plan.row == conv.in_channels;
-      if (!in_place_) grad_input_.reset(new T[static_cast<size_t>(images_ * image_elements())]);
-    }
-    if (tensors_.grad_scale.data != nullptr) {
-      grad_scale_.reset(new T[static_cast<size_t>(units() * images_ * scale_elements())]);
-    }
   }
 
   void run() {
-    std::unique_ptr<T[]> partials;  // [slot][weights, then bias]
-    int64_t slots_used = 0;
-    for (int64_t first = 0; first < conv_.batch; first += images_) {
-      const int64_t images = std::min(images_, conv_.batch - first);
-      input_.pack(conv_, tile_.plan(), tensors_.input, first, images, executor_);
-      guide_.pack(conv_, tensors_.guide, first, images);
-      std::vector<Slot> slots =
-          make_slots<T>(conv_, tensors_.scale, first, images, slots_wanted_, scatters());
-      const int64_t count = static_cast<int64_t>(slots.size());
-      if (count > slots_used) {
-        std::unique_ptr<T[]> grown(new T[static_cast<size_t>(count * partial_elements())]());
-        if (slots_used > 0) {
-          std::copy(partials.get(), partials.get() + slots_used * partial_elements(), grown.get());
-        }
-        partials = std::move(grown);
-        slots_used = count;
-      }
-      prepare_gradients(first, images, slots);
-      run_slots(first, slots, partials.get());
-      add_spill(first, slots);
-      if (scatters() && !in_place_) unpack_gradients(first, images);
-      if (tensors_.grad_scale.data != nullptr) store_scale(first, images);
+    const std::vector<Pass> passes = make_passes<T>(
+        conv_, tensors_.scale, input_.packed() || grad_input_.copies(), input_.row_elements());
+    input_.reserve(passes);
+    grad_input_.reserve(passes);
+    if (tensors_.grad_scale.data != nullptr) {
+      int64_t most = 0;
+      for (const Pass& pass : passes) most = std::max(most, pass.images * scale_elements(pass));
+      grad_scale_.reset(new T[static_cast<size_t>(units() * most)]);
     }
-    store_weights(partials.get(), slots_used);
+    std::vector<T> partials;  // [slot][weights, then bias]
+    for (size_t i = 0; i < passes.size(); ++i) {
+      const Pass& pass = passes[i];
+      const auto same_image = [&](size_t other) {
+        return other < passes.size() && passes[other].first_image == pass.first_image
+                   ? &passes[other]
+                   : nullptr;
+      };
+      const Pass* previous = i > 0 ? same_image(i - 1) : nullptr;
+      input_.pack(pass, executor_);
+      guide_.pack(pass);
+      grad_input_.begin(pass, previous, executor_);
+      std::vector<Slot> slots =
+          make_slots<T>(conv_, tensors_.scale, pass, slots_wanted_, grad_input_.needed());
+      partials.resize(std::max(partials.size(), slots.size() * partial_elements()), T(0));
+      lay_out_spill(pass, slots);
+      run_slots(pass, slots, partials.data());
+      add_spill(pass, slots);
+      grad_input_.end(pass, previous == nullptr, same_image(i + 1), executor_);
+      if (tensors_.grad_scale.data != nullptr) store_scale(pass);
+    }
+    partials.resize(std::max(partials.size(), static_cast<size_t>(partial_elements())), T(0));
+    store_weights(partials.data(), static_cast<int64_t>(partials.size() / partial_elements()));
   }
 
  private:
   static constexpr int64_t kTasks = 32;
 
   int64_t units() const { return static_cast<int64_t>(tile_.units().size()); }
-  bool scatters() const { return tensors_.grad_input.data != nullptr; }
-  int64_t in_pixels() const { return conv_.y.in * conv_.x.in; }
-  int64_t out_pixels() const { return conv_.y.out * conv_.x.out; }
-  int64_t image_elements() const { return in_pixels() * tile_.plan().row; }
-  int64_t row_elements() const { return conv_.x.in * tile_.plan().row; }
-  int64_t scale_elements() const { return conv_.scale_components * out_pixels(); }
-  int64_t partial_elements() const { return weight_elements_ + tile_.bias_elements(); }
-
-  T* gradient_image(int64_t first, int64_t n) const {
-    return in_place_ ? static_cast<T*>(tensors_.grad_input.data) + n * tensors_.grad_input.n
-                     : grad_input_.get() + (n - first) * image_elements();
+  int64_t scale_elements(const Pass& pass) const {
+    return conv_.scale_components * pass.out.count() * conv_.x.out;
+  }
+  size_t partial_elements() const {
+    return static_cast<size_t>(weight_elements_ + tile_.bias_elements());
   }
 
-  // Zeroes the gradient of these images and lays out the slots' spill rows.
-  void prepare_gradients(int64_t first, int64_t images, std::vector<Slot>& slots) {
-    if (!scatters()) return;
-    const int64_t rows = images * conv_.y.in;
-    run_tasks(executor_, rows, workers_for(executor_, rows, images * image_elements() / 4),
-              [&](int, int64_t row) {
-                T* to = gradient_image(first, first + row / conv_.y.in) +
-                        row % conv_.y.in * row_elements();
-                std::fill(to, to + row_elements(), T(0));
-              });
+  // Gives each slot the place of every input row that it scatters to.
+  void lay_out_spill(const Pass& pass, std::vector<Slot>& slots) {
+    if (!grad_input_.needed()) return;
     int64_t spilled = 0;
-    for (const Slot& slot : slots) {
-      spilled += slot.reach_end - slot.reach_begin - (slot.own_end - slot.own_begin);
-    }
-    spill_.reset(spilled > 0 ? new T[static_cast<size_t>(spilled * row_elements())]() : nullptr);
+    for (const Slot& slot : slots) spilled += slot.spilled();
+    const int64_t elements = grad_input_.row_elements();
+    spill_.reset(spilled > 0 ? new T[static_cast<size_t>(spilled * elements)]() : nullptr);
     T* next = spill_.get();
     for (Slot& slot : slots) {
-      const T* image = gradient_image(first, first + slot.first_image);
+      const int64_t n = pass.first_image + slot.first_image;
+      const T* image = grad_input_.row(pass, n, pass.in.begin);
       slot.row_offset.assign(static_cast<size_t>(conv_.y.in), 0);
-      for (int64_t y = slot.reach_begin; y < slot.reach_end; ++y) {
-        const bool own = y >= slot.own_begin && y < slot.own_end;
-        const T* row = own ? image + y * row_elements() : next;
-        slot.row_offset[static_cast<size_t>(y)] = byte_distance(image, row);
-        if (!own) next += row_elements();
+      for (int64_t y = slot.reach.begin; y < slot.reach.end; ++y) {
+        const bool own = slot.own.has(y);
+        slot.row_offset[static_cast<size_t>(y)] =
+            byte_distance(image, own ? grad_input_.row(pass, n, y) : next);
+        if (!own) next += elements;
       }
     }
   }
 
-  void run_slots(int64_t first, const std::vector<Slot>& slots, T* partials) {
+  void add_spill(const Pass& pass, const std::vector<Slot>& slots) {
+    if (!grad_input_.needed() || !spill_) return;
+    const int64_t elements = grad_input_.row_elements(), rows = pass.in.count();
+    run_tasks(executor_, rows, workers_for(executor_, rows, rows * elements), [&](int, int64_t i) {
+      const int64_t y = pass.in.begin + i;
+      for (const Slot& slot : slots) {
+        if (slot.own.has(y) || !slot.reach.has(y)) continue;
+        const int64_t n = pass.first_image + slot.first_image;
+        const T* image = grad_input_.row(pass, n, pass.in.begin);
+        const T* from = reinterpret_cast<const T*>(reinterpret_cast<uintptr_t>(image) +
+                                                   slot.row_offset[static_cast<size_t>(y)]);
+        T* to = grad_input_.row(pass, n, y);
+        for (int64_t e = 0; e < elements; ++e) to[e] += from[e];
+      }
+    });
+  }
+
+  void run_slots(const Pass& pass, const std::vector<Slot>& slots, T* partials) {
     const Plan& plan = tile_.plan();
     const int64_t tasks = static_cast<int64_t>(slots.size()) * units();
-    int64_t pixels = 0;
-    for (const Slot& slot : slots) pixels += slot.images * (slot.end - slot.begin);
+    const int64_t pixels = pass.images * pass.out.count() * conv_.x.out;
     const int workers =
         workers_for(executor_, tasks, pixels * plan.taps * plan.channels * conv_.out_channels);
     Workspace memory(workers * tile_.need());
@@ -113,93 +114,60 @@ class Backward {
     for (int i = 0; i < workers; ++i) scratch.push_back(tile_.take(memory));
     run_tasks(executor_, tasks, workers, [&](int worker, int64_t task) {
       const int64_t unit = task % units(), index = task / units();
-      run_slot(scratch[static_cast<size_t>(worker)], first, slots[static_cast<size_t>(index)], unit,
-               partials + index * partial_elements());
+      run_slot(scratch[static_cast<size_t>(worker)], pass, slots[static_cast<size_t>(index)], unit,
+               partials + static_cast<size_t>(index) * partial_elements());
     });
   }
 
-  void run_slot(typename BackwardTile<T>::Scratch& scratch, int64_t first, const Slot& slot,
+  void run_slot(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
                 int64_t unit, T* partial) {
     constexpr int64_t bytes = sizeof(T);
-    const Plan& plan = tile_.plan();
     typename BackwardTile<T>::Target target{};
     if (tensors_.grad_weight.data != nullptr) {
       target.weight = partial + weight_offset_[static_cast<size_t>(unit)];
     }
     if (tensors_.grad_bias.data != nullptr) target.bias = partial + weight_elements_;
-    const AxisSteps steps_y{input_.step_y(conv_, plan, tensors_.input) * bytes, 0, conv_.x.in,
-                            scatters() ? slot.row_offset.data() : nullptr};
-    const AxisSteps steps_x{input_.step_x(plan, tensors_.input) * bytes, plan.row * bytes, 1};
+    const bool scatters = grad_input_.needed();
+    const AxisSteps steps_y{input_.step_y() * bytes, 0, conv_.x.in,
+                            scatters ? slot.row_offset.data() : nullptr};
+    const AxisSteps steps_x{input_.step_x() * bytes, tile_.plan().row * bytes, 1};
+    target.first_pixel = pass.out.begin * conv_.x.out;
+    target.pixels = pass.out.count() * conv_.x.out;
     for (int64_t i = slot.first_image; i < slot.first_image + slot.images; ++i) {
-      const int64_t n = first + i;
-      target.input =
-          reinterpret_cast<const char*>(input_.image(conv_, plan, tensors_.input, first, n));
-      if (scatters()) target.grad_input = reinterpret_cast<char*>(gradient_image(first, n));
-      if (grad_scale_) target.scale = grad_scale_.get() + (unit * images_ + i) * scale_elements();
-      const T* guide = guide_.image(conv_, tensors_.guide, first, n);
-      for (int64_t begin = slot.begin; begin < slot.end; begin += kTile) {
-        tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide, n, begin,
-                  static_cast<int>(std::min<int64_t>(kTile, slot.end - begin)), steps_y, steps_x);
+      const int64_t n = pass.first_image + i;
+      target.input = input_.image(pass, n);
+      if (scatters) {
+        target.grad_input = reinterpret_cast<char*>(grad_input_.row(pass, n, pass.in.begin));
+      }
+      if (grad_scale_) {
+        target.scale = grad_scale_.get() + (unit * pass.images + i) * scale_elements(pass);
+      }
+      const int64_t end = slot.out.end * conv_.x.out;
+      for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += kTile) {
+        tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(pass, n),
+                  n, begin, static_cast<int>(std::min<int64_t>(kTile, end - begin)), steps_y,
+                  steps_x);
       }
     }
   }
 
-  void add_spill(int64_t first, const std::vector<Slot>& slots) {
-    if (!scatters() || !spill_) return;
-    run_tasks(executor_, conv_.y.in, workers_for(executor_, conv_.y.in, image_elements()),
-              [&](int, int64_t y) {
-                for (const Slot& slot : slots) {
-                  const bool own = y >= slot.own_begin && y < slot.own_end;
-                  if (own || y < slot.reach_begin || y >= slot.reach_end) continue;
-                  T* image = gradient_image(first, first + slot.first_image);
-                  const T* from =
-                      reinterpret_cast<const T*>(reinterpret_cast<const char*>(image) +
-                                                 slot.row_offset[static_cast<size_t>(y)]);
-                  T* to = image + y * row_elements();
-                  for (int64_t i = 0; i < row_elements(); ++i) to[i] += from[i];
-                }
-              });
-  }
-
-  void unpack_gradients(int64_t first, int64_t images) {
-    const Plan& plan = tile_.plan();
-    const int64_t strip = std::max<int64_t>(1, 4096 / plan.row + 1) * 8;
-    const int64_t strips = (in_pixels() + strip - 1) / strip, tasks = images * strips;
-    run_tasks(executor_, tasks, workers_for(executor_, tasks, images * image_elements()),
-              [&](int, int64_t task) {
-                const int64_t n = first + task / strips, begin = task % strips * strip;
-                const int64_t count = std::min(strip, in_pixels() - begin);
-                for (int64_t g = 0; g < plan.groups; ++g) {
-                  store_pixels<T>(
-                      tensors_.grad_input, n, g * plan.channels, plan.channels, conv_.x.in, begin,
-                      count,
-                      gradient_image(first, n) + begin * plan.row + g * to_quads(plan.channels),
-                      plan.row);
-                }
-              });
-  }
-
-  void store_scale(int64_t first, int64_t images) {
-    for (int64_t i = 0; i < images; ++i) {
-      T* sum = grad_scale_.get() + i * scale_elements();
+  void store_scale(const Pass& pass) {
+    const int64_t elements = scale_elements(pass), pixels = pass.out.count() * conv_.x.out;
+    for (int64_t i = 0; i < pass.images; ++i) {
+      T* sum = grad_scale_.get() + i * elements;
       for (int64_t unit = 1; unit < units(); ++unit) {
-        const T* from = grad_scale_.get() + (unit * images_ + i) * scale_elements();
-        for (int64_t p = 0; p < scale_elements(); ++p) sum[p] += from[p];
+        const T* from = grad_scale_.get() + (unit * pass.images + i) * elements;
+        for (int64_t p = 0; p < elements; ++p) sum[p] += from[p];
       }
       for (int64_t k = 0; k < conv_.scale_components; ++k) {
-        store_pixels<T>(tensors_.grad_scale, first + i, k, 1, conv_.x.out, 0, out_pixels(),
-                        sum + k * out_pixels(), 1);
+        store_pixels<T>(tensors_.grad_scale, pass.first_image + i, k, 1, conv_.x.out,
+                        pass.out.begin * conv_.x.out, pixels, sum + k * pixels, 1);
       }
     }
   }
 
   void store_weights(T* partials, int64_t slots) {
-    const int64_t elements = partial_elements();
-    std::vector<T> none;
-    if (slots == 0) {
-      none.assign(static_cast<size_t>(elements), T(0));
-      partials = none.data();
-    }
+    const int64_t elements = static_cast<int64_t>(partial_elements());
     constexpr int64_t kSpan = 4096;
     const int64_t tasks = (elements + kSpan - 1) / kSpan;
     run_tasks(executor_, tasks, workers_for(executor_, tasks, slots * elements / 4),
@@ -241,11 +209,11 @@ class Backward {
   const BackwardTensors& tensors_;
   const Executor& executor_;
   BackwardTile<T> tile_;
-  const int64_t images_, slots_wanted_;
+  const int64_t slots_wanted_;
   InputRows<T> input_;
   GuideRows<T> guide_;
-  bool in_place_ = false;
-  std::unique_ptr<T[]> grad_input_, grad_scale_, spill_;
+  GradientRows<T> grad_input_;
+  std::unique_ptr<T[]> grad_scale_, spill_;
   std::vector<int64_t> weight_offset_;
   int64_t weight_elements_ = 0;
 };

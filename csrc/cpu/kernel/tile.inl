@@ -1,29 +1,3 @@
-// The guide in the compute type, one value a pixel, for a run of images.
-template <class T>
-struct GuideRows {
-  bool given, packed = false;
-  std::unique_ptr<T[]> memory;
-
-  GuideRows(const Conv& conv, const View& guide, int64_t images) : given(guide.data != nullptr) {
-    if (!given) return;
-    const bool same = guide.dtype == kComputeDType<T>;
-    packed = !(same && guide.x == 1 && guide.y == conv.x.in);
-    if (packed) memory.reset(new T[static_cast<size_t>(images * conv.y.in * conv.x.in)]);
-  }
-  const T* image(const Conv& conv, const View& guide, int64_t first, int64_t n) const {
-    if (!given) return nullptr;
-    return packed ? memory.get() + (n - first) * conv.y.in * conv.x.in
-                  : static_cast<const T*>(guide.data) + n * guide.n;
-  }
-  void pack(const Conv& conv, const View& guide, int64_t first, int64_t images) {
-    if (!packed) return;
-    const int64_t pixels = conv.y.in * conv.x.in;
-    for (int64_t n = 0; n < images; ++n) {
-      load_pixels<T>(guide, first + n, 0, 1, conv.x.in, 0, pixels, memory.get() + n * pixels, 1, 1);
-    }
-  }
-};
-
 // One worker's view of the tile it is at: the geometry of up to kTile flat output pixels.
 template <class T>
 class Tile {
@@ -86,11 +60,11 @@ class Tile {
       const int64_t ty = (first_tap + t) / conv_.x.kernel, tx = (first_tap + t) % conv_.x.kernel;
       TapCorners<T>& corners = corners_.taps[static_cast<size_t>(t)];
       if (guide_.image != nullptr) {
-        fill_corners<T, true, Writes, S>(conv_, ty, tx, rows_, columns_, guide_,
-                                         unseen_read, unseen_write, corners);
+        fill_corners<T, true, Writes, S>(conv_, ty, tx, rows_, columns_, guide_, unseen_read,
+                                         unseen_write, corners);
       } else {
-        fill_corners<T, false, Writes, S>(conv_, ty, tx, rows_, columns_, guide_,
-                                          unseen_read, unseen_write, corners);
+        fill_corners<T, false, Writes, S>(conv_, ty, tx, rows_, columns_, guide_, unseen_read,
+                                          unseen_write, corners);
       }
     }
   }

@@ -1,0 +1,172 @@
+// The input is handled in passes: a run of whole images, or, of an image that is large, some output
+// rows and the input rows that their taps may touch. Copies that a pass makes (the input with its
+// channels innermost, gradients in the compute type) are bounded however large the image is, unless
+// its taps reach across all of it. By shape and scale alone, so that sums keep their order.
+struct Rows {
+  int64_t begin, end;
+  int64_t count() const { return end - begin; }
+  bool has(int64_t row) const { return row >= begin && row < end; }
+};
+
+struct Pass {
+  int64_t first_image, images;
+  Rows out;
+  Rows in;  // of successive passes over an image neither bound goes back
+};
+
+// The input rows that taps of output rows `rows` may touch, one row to spare on each side.
+template <class T>
+Rows find_reach(const Conv& conv, const View& scale, int64_t n, Rows rows) {
+  double most = 0;  // zero-offset taps stay at the centre
+  T values[kTile];
+  const int64_t end = rows.end * conv.x.out;
+  for (int64_t first = rows.begin * conv.x.out; first < end; first += kTile) {
+    const int64_t count = std::min<int64_t>(kTile, end - first);
+    load_pixels<T>(scale, n, 0, 1, conv.x.out, first, count, values, 1, 1);
+    for (int64_t m = 0; m < count; ++m) {
+      const double value = std::fabs(static_cast<double>(values[m]));
+      if (value - value == 0) most = std::max(most, value);
+    }
+  }
+  const double tap = static_cast<double>(std::abs(conv.y.tap_doubled(0))) / 2;
+  const auto spread =
+      static_cast<int64_t>(std::min(most * tap + 2, static_cast<double>(conv.y.reach())));
+  const auto clamp = [&](int64_t row) { return std::min(std::max<int64_t>(row, 0), conv.y.in); };
+  return {clamp(conv.y.centre_floor(rows.begin) - spread - 1),
+          clamp(conv.y.centre_floor(rows.end - 1) + spread + 3)};
+}
+
+// copies: the pass copies rows, so their number should be bounded; row: elements of an input row.
+template <class T>
+std::vector<Pass> make_passes(const Conv& conv, const View& scale, bool copies, int64_t row) {
+  constexpr int64_t kElements = int64_t{1} << 22;
+  const int64_t image = std::max<int64_t>(1, conv.y.in * row);
+  std::vector<Pass> passes;
+  if (!copies || image <= kElements || conv.y.out * conv.x.out == 0) {
+    const int64_t images = std::max<int64_t>(1, std::min(conv.batch, kElements / image));
+    for (int64_t n = 0; n < conv.batch; n += images) {
+      passes.push_back({n, std::min(images, conv.batch - n), {0, conv.y.out}, {0, conv.y.in}});
+    }
+    return passes;
+  }
+  for (int64_t n = 0; n < conv.batch; ++n) {
+    const size_t start = passes.size();
+    for (int64_t y = 0; y < conv.y.out; ++y) {
+      const Rows reach = find_reach<T>(conv, scale, n, {y, y + 1});
+      if (passes.size() > start) {
+        Pass& last = passes.back();
+        const Rows both{std::min(last.in.begin, reach.begin), std::max(last.in.end, reach.end)};
+        if (both.count() * row <= kElements) {
+          last.in = both;
+          last.out.end = y + 1;
+          continue;
+        }
+      }
+      passes.push_back({n, 1, {y, y + 1}, reach});
+    }
+    for (size_t i = start + 1; i < passes.size(); ++i) {
+      passes[i].in.end = std::max(passes[i].in.end, passes[i - 1].in.end);
+    }
+    for (size_t i = passes.size() - 1; i-- > start;) {
+      passes[i].in.begin = std::min(passes[i].in.begin, passes[i + 1].in.begin);
+    }
+  }
+  return passes;
+}
+
+// Most rows of input that any pass holds, all its images together.
+inline int64_t most_rows(const std::vector<Pass>& passes) {
+  int64_t most = 0;
+  for (const Pass& pass : passes) most = std::max(most, pass.images * pass.in.count());
+  return most;
+}
+
+// The input as channel-innermost rows: in place where it lies so already, else packed.
+template <class T>
+class InputRows {
+ public:
+  InputRows(const Conv& conv, const Plan& plan, const View& input)
+      : conv_(conv),
+        plan_(plan),
+        input_(input),
+        packed_(
+            !(input.dtype == kComputeDType<T> && plan.row == conv.in_channels && input.c == 1)) {}
+
+  bool packed() const { return packed_; }
+  int64_t row_elements() const { return conv_.x.in * plan_.row; }
+  int64_t step_x() const { return packed_ ? plan_.row : input_.x; }
+  int64_t step_y() const { return packed_ ? row_elements() : input_.y; }
+
+  void reserve(const std::vector<Pass>& passes) {
+    if (packed_) memory_.reset(new T[static_cast<size_t>(most_rows(passes) * row_elements())]);
+  }
+
+  // Where row 0 of image n would lie; only rows of the pass are there.
+  const char* image(const Pass& pass, int64_t n) const {
+    constexpr int64_t bytes = sizeof(T);
+    if (!packed_) return static_cast<const char*>(input_.data) + n * input_.n * bytes;
+    const int64_t row = (n - pass.first_image) * pass.in.count() - pass.in.begin;
+    return reinterpret_cast<const char*>(reinterpret_cast<uintptr_t>(memory_.get()) +
+                                         static_cast<uintptr_t>(row * row_elements() * bytes));
+  }
+
+  void pack(const Pass& pass, const Executor& executor) {
+    if (!packed_) return;
+    const int64_t strip = std::max<int64_t>(1, 4096 / plan_.row + 1) * 8;
+    const int64_t first = pass.in.begin * conv_.x.in, pixels = pass.in.count() * conv_.x.in;
+    const int64_t strips = (pixels + strip - 1) / strip, tasks = pass.images * strips;
+    run_tasks(executor, tasks, workers_for(executor, tasks, pass.images * pixels * plan_.row),
+              [&](int, int64_t task) {
+                const int64_t n = task / strips, begin = task % strips * strip;
+                const int64_t count = std::min(strip, pixels - begin);
+                const int64_t padded = to_quads(plan_.channels);
+                for (int64_t g = 0; g < plan_.groups; ++g) {
+                  load_pixels<T>(input_, pass.first_image + n, g * plan_.channels, plan_.channels,
+                                 conv_.x.in, first + begin, count,
+                                 memory_.get() + (n * pixels + begin) * plan_.row + g * padded,
+                                 plan_.row, padded);
+                }
+              });
+  }
+
+ private:
+  const Conv& conv_;
+  const Plan& plan_;
+  const View& input_;
+  const bool packed_;
+  std::unique_ptr<T[]> memory_;
+};
+
+// The guide in the compute type, one value a pixel, whole images.
+template <class T>
+class GuideRows {
+ public:
+  GuideRows(const Conv& conv, const View& guide)
+      : conv_(conv),
+        guide_(guide),
+        packed_(guide.data != nullptr &&
+                !(guide.dtype == kComputeDType<T> && guide.x == 1 && guide.y == conv.x.in)) {}
+
+  void pack(const Pass& pass) {
+    const int64_t pixels = conv_.y.in * conv_.x.in;
+    if (!packed_ || (packed_image_ == pass.first_image && memory_)) return;
+    memory_.reset(new T[static_cast<size_t>(pass.images * pixels)]);
+    packed_image_ = pass.first_image;
+    for (int64_t n = 0; n < pass.images; ++n) {
+      load_pixels<T>(guide_, pass.first_image + n, 0, 1, conv_.x.in, 0, pixels,
+                     memory_.get() + n * pixels, 1, 1);
+    }
+  }
+  const T* image(const Pass& pass, int64_t n) const {
+    if (guide_.data == nullptr) return nullptr;
+    return packed_ ? memory_.get() + (n - pass.first_image) * conv_.y.in * conv_.x.in
+                   : static_cast<const T*>(guide_.data) + n * guide_.n;
+  }
+
+ private:
+  const Conv& conv_;
+  const View& guide_;
+  const bool packed_;
+  int64_t packed_image_ = -1;
+  std::unique_ptr<T[]> memory_;
+};
