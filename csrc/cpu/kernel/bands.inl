@@ -25,8 +25,10 @@ std::vector<Slot> make_slots(const Conv& conv, const View& scale, const Pass& pa
     return slots;
   }
   const int64_t rows = pass.out.count(), pixels = rows * conv.x.out;
-  int64_t bands =
+  const int64_t most =
       std::min({(wanted + pass.images - 1) / pass.images, pixels / kLeastPixels + 1, rows});
+  int64_t bands = 1;  // a power of two, which two, four or eight threads share evenly
+  while (bands * 2 <= most) bands *= 2;
   for (;; bands /= 2) {
     slots.clear();
     int64_t spill = 0;
