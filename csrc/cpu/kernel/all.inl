@@ -15,8 +15,8 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "forward.inl"
 #include "bands.inl"
 #include "gradient_rows.inl"
+#include "backward_tile.inl"
 #include "backward.inl"
-#include "gradients.inl"
 
 }  // namespace surfconv::cpu::SURFCONV_ISA
 

@@ -1,301 +1,227 @@
-// Backward. A task owns a run of channels (a unit) of one slot: nobody else writes its part of
-// grad_input, its partial grad_weight or its partial grad_scale; partials are summed in a fixed
-// order. For each tile: the gradient of the gathered matrix by one product, a pass that scatters
-// it, takes its dot product with the sample's slope and puts the gathered matrix in its place, and
-// the transposed product of that into grad_weight.
-struct Unit {
-  std::vector<ChannelBlock> blocks;
-};
-
-inline std::vector<Unit> make_units(const std::vector<ChannelBlock>& blocks, int64_t channels) {
-  std::vector<Unit> units;
-  int64_t filled = channels;
-  for (const ChannelBlock& block : blocks) {
-    if (filled >= channels) {
-      units.emplace_back();
-      filled = 0;
-    }
-    units.back().blocks.push_back(block);
-    filled += block.padded;
-  }
-  return units;
-}
-
+// The whole backward: slots and units become tasks, then the partials are summed and stored.
 template <class T>
-class BackwardTile {
+class Backward {
  public:
-  struct Scratch {
-    Tile<T> tile;
-    T* grad_out;  // [groups of the unit][kTile][width]
-    T* rows;      // [kTile][ld_rows]: gradient of the gathered matrix, then the matrix
-    T* dot;       // [2][kTile][lanes]
-    T* discard;   // [row]: what corners that are not seen write
-  };
-  // What a task adds to.
-  struct Target {
-    const char* input;  // image, as bytes
-    char* grad_input;   // image, as bytes; null: not needed
-    T* weight;          // partials of the unit's blocks, one after the other
-    T* bias;            // partial of all outputs, each added by its group's first block
-    T* scale;           // partial of the pass' pixels of the image, [components][pixels]
-    int64_t first_pixel, pixels;
-  };
-
-  BackwardTile(const Conv& conv, const BackwardTensors& tensors)
+  Backward(const Conv& conv, const BackwardTensors& tensors, const Executor& executor)
       : conv_(conv),
         tensors_(tensors),
-        plan_(conv),
-        blocks_(channel_blocks(plan_, kBlock)),
-        units_(make_units(blocks_, kBlock)),
-        taps_(taps_at_once(plan_.taps, std::min(kBlock, to_quads(plan_.channels)))),
-        width_(plan_.depthwise ? plan_.multiplier * kBlock : pad_width<T>(plan_.outputs)),
-        ld_rows_(
-            pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowPad)) +
-            16),
-        needs_matrix_(tensors.grad_input.data != nullptr || tensors.grad_scale.data != nullptr),
-        zeros_(static_cast<size_t>(std::max(plan_.row, ld_rows_) + 2 * kLanes<T>), T(0)) {}
-
-  const Plan& plan() const { return plan_; }
-  const std::vector<Unit>& units() const { return units_; }
-
-  // Elements of the partial grad_weight of a block: rows (tap, channel), padded.
-  int64_t weight_elements(const ChannelBlock& block) const {
-    if (plan_.depthwise) return plan_.taps * plan_.multiplier * block.padded;
-    return round_up(plan_.taps * block.padded, kRowPad) * width_;
-  }
-  int64_t weight_elements(const Unit& unit) const {
-    int64_t total = 0;
-    for (const ChannelBlock& block : unit.blocks) total += weight_elements(block);
-    return total;
-  }
-  int64_t bias_elements() const { return conv_.out_channels; }
-
-  // Where the partial grad_weight of a block keeps each weight:
-  // body(output, channel of the group, tap, index)
-  template <class Body>
-  void for_weights(const ChannelBlock& block, const Body& body) const {
-    for (int64_t t = 0; t < plan_.taps; ++t) {
-      for (int64_t c = 0; c < block.count; ++c) {
-        if (plan_.depthwise) {
-          for (int64_t j = 0; j < plan_.multiplier; ++j) {
-            body((block.first + c) * plan_.multiplier + j, 0, t,
-                 (t * plan_.multiplier + j) * block.padded + c);
-          }
-        } else {
-          for (int64_t o = 0; o < plan_.outputs; ++o) {
-            body(block.group * plan_.outputs + o, block.first + c, t,
-                 (t * block.padded + c) * width_ + o);
-          }
-        }
-      }
+        executor_(executor),
+        tile_(conv, tensors),
+        slots_wanted_(std::max<int64_t>(1, kTasks / units())),
+        input_(conv, tile_.plan(), tensors.input),
+        guide_(conv, tensors.guide),
+        grad_input_(conv, tile_.plan(), tensors.grad_input) {
+    tile_.pack_weights(executor);
+    for (const Unit& unit : tile_.units()) {
+      weight_offset_.push_back(weight_elements_);
+      weight_elements_ += tile_.weight_elements(unit);
     }
   }
 
-  void pack_weights(const Executor& executor) {
-    if (!needs_matrix_) return;
-    if (plan_.depthwise) {
-      weights_.reset(new T[static_cast<size_t>(plan_.taps * plan_.multiplier * plan_.row)]);
-      return pack_depthwise(tensors_.weight, conv_.x.kernel, plan_, weights_.get());
+  void run() {
+    const std::vector<Pass> passes = make_passes<T>(
+        conv_, tensors_.scale, input_.packed() || grad_input_.copies(), input_.row_elements());
+    input_.reserve(passes);
+    grad_input_.reserve(passes);
+    if (tensors_.grad_scale.data != nullptr) {
+      int64_t most = 0;
+      for (const Pass& pass : passes) most = std::max(most, pass.images * scale_elements(pass));
+      grad_scale_.reset(new T[static_cast<size_t>(units() * most)]);
     }
-    const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
-    const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
-    stride_ = pad_width<T>(taps_ * std::min(kBlock, to_quads(plan_.channels))) * plan_.outputs;
-    weights_.reset(new T[static_cast<size_t>(tasks * stride_)]);
-    run_tasks(
-        executor, tasks, workers_for(executor, tasks, tasks * stride_), [&](int, int64_t task) {
-          const int64_t first_tap = task % tap_blocks * taps_;
-          pack_backward(tensors_.weight, conv_.x.kernel, plan_,
-                        blocks_[static_cast<size_t>(task / tap_blocks)], first_tap,
-                        std::min(taps_, plan_.taps - first_tap), weights_.get() + task * stride_);
-        });
-  }
-
-  int64_t need() const {
-    return Tile<T>::need(conv_, taps_) + Workspace::need<T>(most_groups() * kTile * width_) +
-           Workspace::need<T>(kTile * ld_rows_) + Workspace::need<T>(2 * kTile * kLanes<T>) +
-           Workspace::need<T>(plan_.row + kLanes<T>);
-  }
-  Scratch take(Workspace& memory) const {
-    return {Tile<T>(conv_, taps_, memory), memory.take<T>(most_groups() * kTile * width_),
-            memory.take<T>(kTile * ld_rows_), memory.take<T>(2 * kTile * kLanes<T>),
-            memory.take<T>(plan_.row + kLanes<T>)};
-  }
-
-  void run(Scratch& scratch, const Unit& unit, const Target& target, const T* guide, int64_t n,
-           int64_t begin, int count, const AxisSteps& steps_y, const AxisSteps& steps_x) const {
-    scratch.tile.place(tensors_.scale, guide, n, begin, count, steps_y, steps_x);
-    load_gradients(scratch, unit, n, begin, count);
-    if (target.bias != nullptr) add_bias(scratch, unit, count, target.bias);
-    std::fill(scratch.dot, scratch.dot + 2 * kTile * kLanes<T>, T(0));
-    const int64_t unseen_read = byte_distance(target.input, zeros_.data());
-    const int64_t unseen_write = byte_distance(target.grad_input, scratch.discard);
-    for (int64_t first_tap = 0; first_tap < plan_.taps; first_tap += taps_) {
-      const int64_t taps = std::min(taps_, plan_.taps - first_tap);
-      with_needs(target, [&](auto writes, auto slopes) {
-        constexpr bool Writes = decltype(writes)::value;
-        constexpr Slopes S = decltype(slopes)::value;
-        scratch.tile.template fill_taps<Writes, S>(first_tap, taps, unseen_read, unseen_write);
-        T* weight = target.weight;
-        for (const ChannelBlock& block : unit.blocks) {
-          const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
-          if (needs_matrix_) matrix_gradient(scratch, unit, block, first_tap, taps, count);
-          for (int64_t t = 0; t < taps; ++t) {
-            T* rows = scratch.rows + t * block.padded;
-            const char* read = target.input + channel * static_cast<int64_t>(sizeof(T));
-            char* write = nullptr;
-            if constexpr (Writes)
-              write = target.grad_input + channel * static_cast<int64_t>(sizeof(T));
-            if constexpr (Writes || S != Slopes::none) {
-              scatter_tap<T, Writes, S>(scratch.tile.tap(t), read, write, count, block.padded, rows,
-                                        ld_rows_, scratch.dot, scratch.dot + kTile * kLanes<T>);
-            } else {
-              gather_tap(scratch.tile.tap(t), read, count, block.padded, rows, ld_rows_);
-            }
-          }
-          if (weight != nullptr) {
-            weight_gradient(scratch, unit, block, first_tap, taps, count, weight);
-            weight += weight_elements(block);
-          }
-        }
-      });
+    std::vector<T> partials;  // [slot][weights, then bias]
+    for (size_t i = 0; i < passes.size(); ++i) {
+      const Pass& pass = passes[i];
+      const auto same_image = [&](size_t other) {
+        return other < passes.size() && passes[other].first_image == pass.first_image
+                   ? &passes[other]
+                   : nullptr;
+      };
+      const Pass* previous = i > 0 ? same_image(i - 1) : nullptr;
+      input_.pack(pass, executor_);
+      guide_.pack(pass);
+      grad_input_.begin(pass, previous, executor_);
+      std::vector<Slot> slots =
+          make_slots<T>(conv_, tensors_.scale, pass, slots_wanted_, grad_input_.needed());
+      partials.resize(std::max(partials.size(), slots.size() * partial_elements()), T(0));
+      lay_out_spill(pass, slots);
+      run_slots(pass, slots, partials.data());
+      add_spill(pass, slots);
+      grad_input_.end(pass, previous == nullptr, same_image(i + 1), executor_);
+      if (tensors_.grad_scale.data != nullptr) store_scale(pass);
     }
-    if (target.scale != nullptr) {
-      for (int64_t k = 0; k < conv_.scale_components; ++k) {
-        for (int m = 0; m < count; ++m) {
-          target.scale[k * target.pixels + begin - target.first_pixel + m] =
-              sum_lanes<T>(load<Vec<T, kLanes<T>>>(scratch.dot + (k * kTile + m) * kLanes<T>));
-        }
-      }
-    }
+    partials.resize(std::max(partials.size(), static_cast<size_t>(partial_elements())), T(0));
+    store_weights(partials.data(), static_cast<int64_t>(partials.size() / partial_elements()));
   }
 
  private:
-  static constexpr int64_t kBlock = 64;
+  static constexpr int64_t kTasks = 32;
 
-  int64_t most_groups() const {
-    int64_t most = 1;
-    for (const Unit& unit : units_) {
-      most = std::max(most, unit.blocks.back().group - unit.blocks.front().group + 1);
-    }
-    return most;
+  int64_t units() const { return static_cast<int64_t>(tile_.units().size()); }
+  int64_t scale_elements(const Pass& pass) const {
+    return conv_.scale_components * pass.out.count() * conv_.x.out;
+  }
+  size_t partial_elements() const {
+    return static_cast<size_t>(weight_elements_ + tile_.bias_elements());
   }
 
-  template <class Body>
-  void with_needs(const Target& target, const Body& body) const {
-    const auto by_slopes = [&](auto writes) {
-      if (target.scale == nullptr) {
-        body(writes, std::integral_constant<Slopes, Slopes::none>{});
-      } else if (conv_.scale_components == 1) {
-        body(writes, std::integral_constant<Slopes, Slopes::one>{});
-      } else {
-        body(writes, std::integral_constant<Slopes, Slopes::two>{});
+  // Gives each slot the place of every input row that it scatters to.
+  void lay_out_spill(const Pass& pass, std::vector<Slot>& slots) {
+    if (!grad_input_.needed()) return;
+    int64_t spilled = 0;
+    for (const Slot& slot : slots) spilled += slot.spilled();
+    const int64_t elements = grad_input_.row_elements();
+    spill_.reset(spilled > 0 ? new T[static_cast<size_t>(spilled * elements)]() : nullptr);
+    T* next = spill_.get();
+    for (Slot& slot : slots) {
+      const int64_t n = pass.first_image + slot.first_image;
+      const T* image = grad_input_.row(pass, n, pass.in.begin);
+      slot.row_offset.assign(static_cast<size_t>(conv_.y.in), 0);
+      for (int64_t y = slot.reach.begin; y < slot.reach.end; ++y) {
+        const bool own = slot.own.has(y);
+        slot.row_offset[static_cast<size_t>(y)] =
+            byte_distance(image, own ? grad_input_.row(pass, n, y) : next);
+        if (!own) next += elements;
       }
-    };
-    target.grad_input != nullptr ? by_slopes(std::true_type{}) : by_slopes(std::false_type{});
+    }
   }
 
-  T* gradients(Scratch& scratch, const Unit& unit, const ChannelBlock& block) const {
-    return scratch.grad_out + (block.group - unit.blocks.front().group) * kTile * width_;
-  }
-
-  void load_gradients(Scratch& scratch, const Unit& unit, int64_t n, int64_t begin,
-                      int count) const {
-    if (plan_.depthwise) {
-      // [pixel][multiplier][kBlock]: a unit of depthwise channels is one block.
-      const ChannelBlock& block = unit.blocks.front();
-      View view = tensors_.grad_output;
-      view.c *= plan_.multiplier;
-      for (int64_t j = 0; j < plan_.multiplier; ++j) {
-        View plane = view;
-        advance(plane, j * tensors_.grad_output.c);
-        load_pixels<T>(plane, n, block.first, block.count, conv_.x.out, begin, count,
-                       scratch.grad_out + j * kBlock, width_, block.padded);
+  void add_spill(const Pass& pass, const std::vector<Slot>& slots) {
+    if (!grad_input_.needed() || !spill_) return;
+    const int64_t elements = grad_input_.row_elements(), rows = pass.in.count();
+    run_tasks(executor_, rows, workers_for(executor_, rows, rows * elements), [&](int, int64_t i) {
+      const int64_t y = pass.in.begin + i;
+      for (const Slot& slot : slots) {
+        if (slot.own.has(y) || !slot.reach.has(y)) continue;
+        const int64_t n = pass.first_image + slot.first_image;
+        const T* image = grad_input_.row(pass, n, pass.in.begin);
+        const T* from = reinterpret_cast<const T*>(reinterpret_cast<uintptr_t>(image) +
+                                                   slot.row_offset[static_cast<size_t>(y)]);
+        T* to = grad_input_.row(pass, n, y);
+        for (int64_t e = 0; e < elements; ++e) to[e] += from[e];
       }
-      return;
+    });
+  }
+
+  void run_slots(const Pass& pass, const std::vector<Slot>& slots, T* partials) {
+    const Plan& plan = tile_.plan();
+    const int64_t tasks = static_cast<int64_t>(slots.size()) * units();
+    const int64_t pixels = pass.images * pass.out.count() * conv_.x.out;
+    const int workers =
+        workers_for(executor_, tasks, pixels * plan.taps * plan.channels * conv_.out_channels);
+    Workspace memory(workers * tile_.need());
+    std::vector<typename BackwardTile<T>::Scratch> scratch;
+    scratch.reserve(static_cast<size_t>(workers));
+    for (int i = 0; i < workers; ++i) scratch.push_back(tile_.take(memory));
+    run_tasks(executor_, tasks, workers, [&](int worker, int64_t task) {
+      const int64_t unit = task % units(), index = task / units();
+      run_slot(scratch[static_cast<size_t>(worker)], pass, slots[static_cast<size_t>(index)], unit,
+               partials + static_cast<size_t>(index) * partial_elements());
+    });
+  }
+
+  void run_slot(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
+                int64_t unit, T* partial) {
+    constexpr int64_t bytes = sizeof(T);
+    typename BackwardTile<T>::Target target{};
+    if (tensors_.grad_weight.data != nullptr) {
+      target.weight = partial + weight_offset_[static_cast<size_t>(unit)];
     }
-    for (int64_t g = unit.blocks.front().group; g <= unit.blocks.back().group; ++g) {
-      load_pixels<T>(tensors_.grad_output, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin,
-                     count, scratch.grad_out + (g - unit.blocks.front().group) * kTile * width_,
-                     width_, width_);
+    if (tensors_.grad_bias.data != nullptr) target.bias = partial + weight_elements_;
+    const bool scatters = grad_input_.needed();
+    const AxisSteps steps_y{input_.step_y() * bytes, 0, conv_.x.in,
+                            scatters ? slot.row_offset.data() : nullptr};
+    const AxisSteps steps_x{input_.step_x() * bytes, tile_.plan().row * bytes, 1};
+    target.first_pixel = pass.out.begin * conv_.x.out;
+    target.pixels = pass.out.count() * conv_.x.out;
+    for (int64_t i = slot.first_image; i < slot.first_image + slot.images; ++i) {
+      const int64_t n = pass.first_image + i;
+      target.input = input_.image(pass, n);
+      if (scatters) {
+        target.grad_input = reinterpret_cast<char*>(grad_input_.row(pass, n, pass.in.begin));
+      }
+      if (grad_scale_) {
+        target.scale = grad_scale_.get() + (unit * pass.images + i) * scale_elements(pass);
+      }
+      const int64_t end = slot.out.end * conv_.x.out;
+      for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += kTile) {
+        tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(pass, n),
+                  n, begin, static_cast<int>(std::min<int64_t>(kTile, end - begin)), steps_y,
+                  steps_x);
+      }
     }
   }
 
-  void add_bias(Scratch& scratch, const Unit& unit, int count, T* bias) const {
-    for (const ChannelBlock& block : unit.blocks) {
-      const T* from = gradients(scratch, unit, block);
-      if (plan_.depthwise) {
-        for (int m = 0; m < count; ++m) {
-          for (int64_t j = 0; j < plan_.multiplier; ++j) {
-            for (int64_t c = 0; c < block.count; ++c) {
-              bias[(block.first + c) * plan_.multiplier + j] += from[m * width_ + j * kBlock + c];
-            }
-          }
+  void store_scale(const Pass& pass) {
+    const int64_t elements = scale_elements(pass), pixels = pass.out.count() * conv_.x.out;
+    for (int64_t i = 0; i < pass.images; ++i) {
+      T* sum = grad_scale_.get() + i * elements;
+      for (int64_t unit = 1; unit < units(); ++unit) {
+        const T* from = grad_scale_.get() + (unit * pass.images + i) * elements;
+        for (int64_t p = 0; p < elements; ++p) sum[p] += from[p];
+      }
+      for (int64_t k = 0; k < conv_.scale_components; ++k) {
+        store_pixels<T>(tensors_.grad_scale, pass.first_image + i, k, 1, conv_.x.out,
+                        pass.out.begin * conv_.x.out, pixels, sum + k * pixels, 1);
+      }
+    }
+  }
+
+  void store_weights(T* partials, int64_t slots) {
+    const int64_t elements = static_cast<int64_t>(partial_elements());
+    constexpr int64_t kSpan = 4096;
+    const int64_t tasks = (elements + kSpan - 1) / kSpan;
+    run_tasks(executor_, tasks, workers_for(executor_, tasks, slots * elements / 4),
+              [&](int, int64_t task) {
+                const int64_t begin = task * kSpan, end = std::min(elements, begin + kSpan);
+                for (int64_t slot = 1; slot < slots; ++slot) {
+                  const T* from = partials + slot * elements;
+                  for (int64_t i = begin; i < end; ++i) partials[i] += from[i];
+                }
+              });
+    if (tensors_.grad_bias.data != nullptr) {
+      visit_storage<T>(tensors_.grad_bias, [&](auto* to) {
+        for (int64_t o = 0; o < conv_.out_channels; ++o) {
+          narrow(partials[weight_elements_ + o], to + o * tensors_.grad_bias.c);
         }
-      } else if (block.first == 0) {
-        T* to = bias + block.group * plan_.outputs;
-        for (int m = 0; m < count; ++m) {
-          for (int64_t o = 0; o < plan_.outputs; ++o) to[o] += from[m * width_ + o];
-        }
+      });
+    }
+    if (tensors_.grad_weight.data == nullptr) return;
+    for (int64_t unit = 0; unit < units(); ++unit) {
+      const T* from = partials + weight_offset_[static_cast<size_t>(unit)];
+      for (const ChannelBlock& block : tile_.units()[static_cast<size_t>(unit)].blocks) {
+        store_block(block, from);
+        from += tile_.weight_elements(block);
       }
     }
   }
 
-  void matrix_gradient(Scratch& scratch, const Unit& unit, const ChannelBlock& block,
-                       int64_t first_tap, int64_t taps, int count) const {
-    const T* from = gradients(scratch, unit, block);
-    if (!plan_.depthwise) {
-      const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
-      const int64_t index = (&block - unit.blocks.data()) + block_index(unit);
-      gemm_packed<T>(round_up(count, kRowPad), taps * block.padded, plan_.outputs, from, width_,
-                     weights_.get() + (index * tap_blocks + first_tap / taps_) * stride_,
-                     scratch.rows, ld_rows_, zeros_.data());
-      return;
-    }
-    depthwise_matrix_gradient<T>(depthwise(block, first_tap, taps), count, from, width_, kBlock,
-                                 weights_.get(), scratch.rows, ld_rows_);
-  }
-
-  void weight_gradient(Scratch& scratch, const Unit& unit, const ChannelBlock& block,
-                       int64_t first_tap, int64_t taps, int count, T* weight) const {
-    const T* from = gradients(scratch, unit, block);
-    if (!plan_.depthwise) {
-      const int64_t used = taps * block.padded, rows = round_up(used, kRowPad);
-      if (rows > used) {  // else the rows that pad a block of the product would add what lies there
-        for (int m = 0; m < count; ++m) {
-          std::fill(scratch.rows + m * ld_rows_ + used, scratch.rows + m * ld_rows_ + rows, T(0));
-        }
-      }
-      gemm_transposed<T>(rows, plan_.outputs, count, scratch.rows, ld_rows_, from, width_,
-                         weight + first_tap * block.padded * width_, width_);
-      return;
-    }
-    depthwise_weight_gradient<T>(depthwise(block, first_tap, taps), count, scratch.rows, ld_rows_,
-                                 from, width_, kBlock,
-                                 weight + first_tap * plan_.multiplier * block.padded);
-  }
-
-  DepthwiseBlock depthwise(const ChannelBlock& block, int64_t first_tap, int64_t taps) const {
-    return {plan_.multiplier, block.padded, taps, plan_.row,
-            first_tap * plan_.multiplier * plan_.row + block.first};
-  }
-
-  int64_t block_index(const Unit& unit) const {
-    int64_t index = 0;
-    for (const Unit& earlier : units_) {
-      if (&earlier == &unit) break;
-      index += static_cast<int64_t>(earlier.blocks.size());
-    }
-    return index;
+  void store_block(const ChannelBlock& block, const T* from) {
+    const View& to = tensors_.grad_weight;
+    visit_storage<T>(to, [&](auto* data) {
+      tile_.for_weights(block, [&](int64_t output, int64_t channel, int64_t tap, int64_t index) {
+        narrow(from[index], data + output * to.n + channel * to.c + tap / conv_.x.kernel * to.y +
+                                tap % conv_.x.kernel * to.x);
+      });
+    });
   }
 
   const Conv& conv_;
   const BackwardTensors& tensors_;
-  const Plan plan_;
-  const std::vector<ChannelBlock> blocks_;
-  const std::vector<Unit> units_;
-  const int64_t taps_, width_, ld_rows_;
-  const bool needs_matrix_;
-  const std::vector<T> zeros_;
-  std::unique_ptr<T[]> weights_;
-  int64_t stride_ = 0;
+  const Executor& executor_;
+  BackwardTile<T> tile_;
+  const int64_t slots_wanted_;
+  InputRows<T> input_;
+  GuideRows<T> guide_;
+  GradientRows<T> grad_input_;
+  std::unique_ptr<T[]> grad_scale_, spill_;
+  std::vector<int64_t> weight_offset_;
+  int64_t weight_elements_ = 0;
 };
+
+void backward(const Conv& conv, const BackwardTensors& tensors, const Executor& executor) {
+  if (tensors.input.dtype == DType::f64) {
+    Backward<double>(conv, tensors, executor).run();
+  } else {
+    Backward<float>(conv, tensors, executor).run();
+  }
+}
