@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -90,31 +90,53 @@ def depth_to_scale(
             "depth: expected (..., H, W) with a (y, x) pair as reference_depth,"
             f" got {tuple(depth.shape)}"
         )
-    metres = depth if levels is None else levels.quantize(depth)
-    metres = metres.to(torch.float64 if depth.dtype == torch.float64 else torch.float32)
-    valid = valid_depth(metres)
-    if isinstance(reference, tuple):
-        wanted = torch.stack([_divide(r, metres, valid, depth.dtype) for r in reference], -3)
-        valid = valid.unsqueeze(-3)
+    dtype = torch.float64 if depth.dtype == torch.float64 else torch.float32
+    references = reference if isinstance(reference, tuple) else (reference,)
+    limits = ScaleLimits(invalid_scale, min_scale, min(max_scale, torch.finfo(dtype).max))
+    if levels is not None:
+        level = levels.assign(depth)
+        scales = [_of_levels(r, levels, level, dtype, limits) for r in references]
+    elif depth.requires_grad and torch.is_grad_enabled():
+        scales = [_differentiable(r, depth.to(dtype), depth.dtype, limits) for r in references]
     else:
-        wanted = _divide(reference, metres, valid, depth.dtype)
-    clamped = valid & ((wanted < min_scale) | (wanted > max_scale))
+        scales = [_of_depth(r, depth.to(dtype), limits) for r in references]
     if min_scale > 0 or max_scale < math.inf:
-        _warn_of_clamping(clamped, valid, min_scale, max_scale)
-    largest = torch.finfo(wanted.dtype).max
-    limited = wanted.detach().clamp(min_scale, min(max_scale, largest))
-    scale = torch.where(clamped | (wanted > largest), limited, wanted)
-    return torch.where(valid, scale, invalid_scale)
+        _warn_of_clamping(references, depth, levels, limits)
+    return torch.stack(scales, -3) if isinstance(reference, tuple) else scales[0]
 
 
-def _divide(reference: float, metres: Tensor, valid: Tensor, dtype: torch.dtype) -> Tensor:
-    """``reference / metres``, constant where invalid or where its derivative would overflow."""
-    safe = torch.where(valid, metres, 1.0)
-    constant = (reference / safe).detach()
+class ScaleLimits(NamedTuple):
+    """What becomes of scales that depth does not give, or not within bounds."""
+
+    invalid: float
+    low: float
+    high: float
+
+
+def _of_depth(reference: float, metres: Tensor, limits: ScaleLimits) -> Tensor:
+    scale = (reference / metres).clamp(limits.low, limits.high)
+    return torch.where(valid_depth(metres), scale, limits.invalid)
+
+
+def _of_levels(
+    reference: float, levels: DepthLevels, level: Tensor, dtype: torch.dtype, limits: ScaleLimits
+) -> Tensor:
+    """One scale per level; level -1 indexes the last entry, so the invalid scale stands there."""
+    scales = [min(max(reference / c, limits.low), limits.high) for c in levels.centers]
+    return torch.tensor((*scales, limits.invalid), dtype=dtype, device=level.device)[level]
+
+
+def _differentiable(
+    reference: float, metres: Tensor, depth_dtype: torch.dtype, limits: ScaleLimits
+) -> Tensor:
+    """The same as :func:`_of_depth`, constant wherever its derivative is not to flow."""
+    constant = _of_depth(reference, metres.detach(), limits)
+    safe = torch.where(valid_depth(metres), metres, 1.0)
+    wanted = (reference / safe).detach()
     # The derivative also has to fit the depth's own dtype, which may be a half type.
-    steepness = constant / safe.detach()
-    smooth = valid & (steepness <= torch.finfo(dtype).max)
-    return torch.where(smooth, reference / torch.where(smooth, safe, 1.0), constant)
+    steep = wanted / safe.detach() > torch.finfo(depth_dtype).max
+    flows = valid_depth(metres) & (wanted >= limits.low) & (wanted <= limits.high) & ~steep
+    return torch.where(flows, reference / torch.where(flows, metres, 1.0), constant)
 
 
 def at_output_centers(
@@ -204,12 +226,21 @@ def check_levels(levels: Any) -> None:
         raise TypeError(f"levels: expected DepthLevels or None, got {type(levels).__name__}")
 
 
-def _warn_of_clamping(clamped: Tensor, valid: Tensor, low: float, high: float) -> None:
+def _warn_of_clamping(
+    references: tuple[float, ...],
+    depth: Tensor,
+    levels: DepthLevels | None,
+    limits: ScaleLimits,
+) -> None:
     global _warned_of_clamping
     if _warned_of_clamping or torch.compiler.is_compiling():
         return
+    metres = depth.detach().to(torch.float64) if levels is None else levels.quantize(depth)
+    valid = valid_depth(metres)
+    clamped = [valid & ((r / metres < limits.low) | (r / metres > limits.high)) for r in references]
     try:
-        count, total = int(clamped.sum()), int(valid.expand_as(clamped).sum())
+        count = sum(int(c.sum()) for c in clamped)
+        total = len(references) * int(valid.sum())
     except RuntimeError:
         # Under vmap and in traces values cannot be read; an eager call will tell.
         return
@@ -217,8 +248,8 @@ def _warn_of_clamping(clamped: Tensor, valid: Tensor, low: float, high: float) -
         _warned_of_clamping = True
         warnings.warn(
             f"depth_to_scale: {count / total:.0%} of the valid pixels have a scale outside"
-            f" [min_scale, max_scale] = [{low}, {high}] and were clamped; check that depth and"
-            " reference_depth are both in metres. This is said once.",
+            f" [min_scale, max_scale] = [{limits.low}, {limits.high}] and were clamped; check that"
+            " depth and reference_depth are both in metres. This is said once.",
             UserWarning,
             stacklevel=3,
         )

@@ -6,10 +6,11 @@ import json
 import math
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -54,6 +55,8 @@ class DepthLevels:
     edges: tuple[float, ...]
     centers: tuple[float, ...]
     gamma: float | None = None
+    # The edges as float32 depths meet them, once for all calls.
+    _single_edges: tuple[float, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         edges = _ascending(self.edges, "edges")
@@ -66,6 +69,7 @@ class DepthLevels:
                 f" got {len(edges)}"
             )
         object.__setattr__(self, "edges", edges)
+        object.__setattr__(self, "_single_edges", _round_down(edges))
         object.__setattr__(self, "centers", centers)
         if self.gamma is not None:
             object.__setattr__(self, "gamma", check_finite(self.gamma, "gamma"))
@@ -91,11 +95,11 @@ class DepthLevels:
             tensor([0, 1])
         """
         depth = check_depth_tensor(depth).detach()
-        # Edges are doubles: rounding them to a float32 depth's dtype could move a depth that
-        # equals an edge. Devices without float64 have no better than their own dtype.
-        wide = depth if depth.device.type == "mps" else depth.to(torch.float64)
-        edges = torch.tensor(self.edges, dtype=wide.dtype, device=wide.device)
-        level = torch.bucketize(wide, edges)
+        double = depth.dtype == torch.float64
+        wide = depth if double else depth.to(torch.float32)
+        edges = self.edges if double else self._single_edges
+        boundaries = torch.tensor(edges, dtype=wide.dtype, device=wide.device)
+        level = torch.bucketize(wide, boundaries)
         return torch.where(valid_depth(depth), level, -1)
 
     def quantize(self, depth: Tensor) -> Tensor:
@@ -166,6 +170,14 @@ class DepthLevels:
 def valid_depth(depth: Tensor) -> Tensor:
     """Where a depth is positive and finite."""
     return (depth > 0) & depth.isfinite()
+
+
+def _round_down(edges: tuple[float, ...]) -> tuple[float, ...]:
+    """float32 edges that part float32 depths just as the exact ones do."""
+    with np.errstate(over="ignore"):
+        nearest = np.asarray(edges, dtype=np.float32)
+    below = np.nextafter(nearest, np.float32(0))
+    return tuple(np.where(nearest.astype(np.float64) > edges, below, nearest).tolist())
 
 
 def _ascending(values: Any, name: str) -> tuple[float, ...]:
