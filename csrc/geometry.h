@@ -46,28 +46,32 @@ struct Axis {
   }
 };
 
-// Where a sample falls: between pixel `lo` and `lo + 1`, `fraction` of the way.
-template <class T, class Int>
+// Where samples fall: between pixel `lo` and `lo + 1`, `fraction` of the way. All members are
+// vectors of as many lanes; masks hold 0 or -1.
+template <class Real, class Integer>
 struct Position {
-  Int lo;
-  T fraction;
-  bool reachable;  // false: not finite, or so far away that no image reaches it
+  Integer lo;
+  Real fraction;
+  Integer reachable;  // 0: not finite, or so far away that no image reaches it
 };
 
-// half is 0.5 where centres lie between pixels, else 0; centre is centre_floor.
-// limit bounds the offset so that centre + offset fits in Int.
+// Real and Integer are vectors of floating-point numbers and integers; centre is centre_floor, half
+// is 0.5 where centres lie between pixels, else 0. limit bounds the offset so that centre + offset
+// fits in a lane of Integer.
 // A sample exactly on a pixel counts to the cell it moves into as the scale grows: then the
 // derivatives of all taps are the same one-sided derivative. Descending: the tap is negative.
-template <bool Descending, class T, class Int>
-inline __attribute__((always_inline)) Position<T, Int> locate(Int centre, T half, T tap, T scale,
-                                                              T limit) {
-  T offset = half + scale * tap;
-  const bool reachable = (offset < limit) & (offset > -limit);  // NaN compares false
-  offset = reachable ? offset : T(0);
-  Int whole = static_cast<Int>(offset);
-  const T floor = static_cast<T>(whole);
-  whole -= (Descending ? floor >= offset : floor > offset) ? 1 : 0;
-  return {static_cast<Int>(centre + whole), offset - static_cast<T>(whole), reachable};
+template <bool Descending, class Real, class Integer, class T>
+inline __attribute__((always_inline)) Position<Real, Integer> locate(Integer centre, T half, T tap,
+                                                                     Real scale, T limit) {
+  Real offset = half + scale * tap;
+  const auto near = (offset < limit) & (offset > -limit);  // NaN compares false
+  offset = near ? offset : Real{};
+  Integer whole = __builtin_convertvector(offset, Integer);
+  const Real truncated = __builtin_convertvector(whole, Real);
+  const auto above = Descending ? truncated >= offset : truncated > offset;
+  whole += __builtin_convertvector(above, Integer);
+  return {centre + whole, offset - __builtin_convertvector(whole, Real),
+          __builtin_convertvector(near, Integer)};
 }
 
 }  // namespace surfconv

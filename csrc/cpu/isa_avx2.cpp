@@ -10,6 +10,7 @@
 #define SURFCONV_ISA avx2_isa
 #define SURFCONV_VECTOR_BYTES 32
 #define SURFCONV_GEMM_ROWS 6
+#define SURFCONV_GEMM_NARROW_ROWS 12
 #include "kernel/all.inl"
 
 #pragma GCC pop_options

@@ -9,7 +9,8 @@
 
 #define SURFCONV_ISA avx512_isa
 #define SURFCONV_VECTOR_BYTES 64
-#define SURFCONV_GEMM_ROWS 12
+#define SURFCONV_GEMM_ROWS 6
+#define SURFCONV_GEMM_NARROW_ROWS 6
 #include "kernel/all.inl"
 
 #pragma GCC pop_options

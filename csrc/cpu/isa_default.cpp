@@ -5,6 +5,7 @@
 #define SURFCONV_ISA default_isa
 #define SURFCONV_VECTOR_BYTES 16
 #define SURFCONV_GEMM_ROWS 6
+#define SURFCONV_GEMM_NARROW_ROWS 12
 #include "kernel/all.inl"
 
 namespace surfconv::cpu {

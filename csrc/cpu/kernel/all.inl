@@ -23,3 +23,4 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #undef SURFCONV_ISA
 #undef SURFCONV_VECTOR_BYTES
 #undef SURFCONV_GEMM_ROWS
+#undef SURFCONV_GEMM_NARROW_ROWS

@@ -43,7 +43,7 @@ SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t ld
 #undef SURFCONV_STORE
 }
 
-// Rows of A, B's panels and C are padded to these, so that there is one block shape for each width.
+// Rows of A and C are padded to it, so that there is one block shape for each width.
 constexpr int64_t kRowPad = 12;
 template <class T>
 SURFCONV_INLINE int64_t pad_width(int64_t width) {
@@ -53,7 +53,8 @@ SURFCONV_INLINE int64_t pad_width(int64_t width) {
 template <class T, bool TransposedA>
 void gemm_panel(bool wide, int64_t rows, int64_t depth, const T* a, int64_t lda, const T* b,
                 int64_t ldb, T* c, int64_t ldc, const T* initial) {
-  constexpr int R = SURFCONV_GEMM_ROWS;
+  constexpr int R = SURFCONV_GEMM_ROWS, S = SURFCONV_GEMM_NARROW_ROWS;
+  static_assert(kRowPad % R == 0 && kRowPad % S == 0, "whole blocks only");
   const int64_t row_step = TransposedA ? 1 : lda;
   if (wide) {
     for (int64_t r = 0; r < rows; r += R) {
@@ -61,9 +62,9 @@ void gemm_panel(bool wide, int64_t rows, int64_t depth, const T* a, int64_t lda,
                                        initial);
     }
   } else {
-    for (int64_t r = 0; r < rows; r += kRowPad) {
-      gemm_block<T, kRowPad, 1, TransposedA>(depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc,
-                                             initial);
+    for (int64_t r = 0; r < rows; r += S) {
+      gemm_block<T, S, 1, TransposedA>(depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc,
+                                       initial);
     }
   }
 }

@@ -50,16 +50,24 @@ SURFCONV_INLINE void fill_offsets(const Int* __restrict lo, int sides, int64_t s
 template <bool Descending, class T, class Int>
 void locate_tile(T half, T tap, Int size, const T* __restrict scale, const Int* __restrict centre,
                  Int* __restrict lo, T* __restrict weight, T* __restrict inside) {
+  constexpr int lanes = sizeof(T) == sizeof(Int) ? kLanes<T> : 1;
+  using Real = Vec<T, lanes>;
+  using Integer = Vec<Int, lanes>;
+  using Mask = decltype(Real{} > Real{});
   const T limit = static_cast<T>(int64_t{1} << (sizeof(Int) == 4 ? 29 : 61));
-  for (int m = 0; m < kTile; ++m) {
-    const auto position = locate<Descending, T, Int>(centre[m], half, tap, scale[m], limit);
-    const bool in_lo = position.reachable & (position.lo >= 0) & (position.lo < size);
-    const bool in_hi = position.reachable & (position.lo >= -1) & (position.lo < size - 1);
-    lo[m] = position.lo;
-    inside[m] = in_lo ? T(1) : T(0);
-    inside[kTile + m] = in_hi ? T(1) : T(0);
-    weight[m] = in_lo ? 1 - position.fraction : T(0);
-    weight[kTile + m] = in_hi ? position.fraction : T(0);
+  const Real zero{}, one = zero + T(1);
+  for (int m = 0; m < kTile; m += lanes) {
+    const auto position =
+        locate<Descending>(load<Integer>(centre + m), half, tap, load<Real>(scale + m), limit);
+    const Integer at = position.lo;
+    const auto in_lo = __builtin_convertvector(position.reachable & (at >= 0) & (at < size), Mask);
+    const auto in_hi =
+        __builtin_convertvector(position.reachable & (at >= -1) & (at < size - 1), Mask);
+    store(lo + m, at);
+    store(inside + m, in_lo ? one : zero);
+    store(inside + kTile + m, in_hi ? one : zero);
+    store(weight + m, in_lo ? one - position.fraction : zero);
+    store(weight + kTile + m, in_hi ? position.fraction : zero);
   }
 }
 

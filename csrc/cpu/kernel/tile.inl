@@ -51,7 +51,10 @@ class Tile {
       fill_axis<T, Int>(conv_.y, steps_y, scale_y, centre_y, rows_);
       fill_axis<T, Int>(conv_.x, steps_x, scale_x, centre_x, columns_);
     };
-    narrow_ ? fill(int32_t{}) : fill(int64_t{});
+    if constexpr (sizeof(T) == 4) {
+      if (narrow_) return fill(int32_t{});
+    }
+    fill(int64_t{});
   }
 
   template <bool Writes, Slopes S>
