@@ -34,11 +34,15 @@ def everywhere(size: tuple[int, int], generator: torch.Generator) -> Tensor:
 
 @pytest.mark.parametrize("stride", [1, 3, 97])
 @pytest.mark.parametrize("pattern", [smooth, far_in_the_middle, everywhere])
-def test_passes_match_the_reference(pattern: object, stride: int) -> None:
+@pytest.mark.parametrize("in_place", [False, True], ids=["copied", "in_place"])
+def test_passes_match_the_reference(pattern: object, stride: int, in_place: bool) -> None:
     generator = torch.Generator().manual_seed(3)
     size = ((HEIGHT - 2) // stride + 1, (WIDTH - 2) // stride + 1)
-    x = torch.randn(1, 3, HEIGHT, WIDTH, generator=generator)
-    weight = torch.randn(2, 3, 2, 2, generator=generator)
+    channels = 4 if in_place else 3
+    x = torch.randn(1, channels, HEIGHT, WIDTH, generator=generator)
+    if in_place:
+        x = x.contiguous(memory_format=torch.channels_last)
+    weight = torch.randn(2, channels, 2, 2, generator=generator)
     scale = pattern(size, generator)  # type: ignore[operator]
     grad = torch.randn(1, 2, *size, generator=generator)
     leaves = [t.requires_grad_() for t in (x, weight, scale)]

@@ -19,8 +19,9 @@ class Backward {
   }
 
   void run() {
-    const std::vector<Pass> passes = make_passes<T>(
-        conv_, tensors_.scale, input_.packed() || grad_input_.copies(), input_.row_elements());
+    // In passes even where nothing is copied: spill rows and partial sums are bounded with them.
+    const std::vector<Pass> passes =
+        make_passes<T>(conv_, tensors_.scale, true, input_.row_elements());
     input_.reserve(passes);
     grad_input_.reserve(passes);
     if (tensors_.grad_scale.data != nullptr) {
