@@ -60,10 +60,12 @@ void locate_tile(T half, T tap, Int size, const T* __restrict scale, const Int* 
     const auto position =
         locate<Descending>(load<Integer>(centre + m), half, tap, load<Real>(scale + m), limit);
     const Integer at = position.lo;
-    const auto in_lo = __builtin_convertvector(position.reachable & (at >= 0) & (at < size), Mask);
-    const auto in_hi =
-        __builtin_convertvector(position.reachable & (at >= -1) & (at < size - 1), Mask);
-    store(lo + m, at);
+    const Integer lo_in = position.reachable & (at >= 0) & (at < size);
+    const Integer hi_in = position.reachable & (at >= -1) & (at < size - 1);
+    const auto in_lo = __builtin_convertvector(lo_in, Mask);
+    const auto in_hi = __builtin_convertvector(hi_in, Mask);
+    // Far positions become pixel 0, of which nothing is seen: their offsets could overflow.
+    store(lo + m, at & (lo_in | hi_in));
     store(inside + m, in_lo ? one : zero);
     store(inside + kTile + m, in_hi ? one : zero);
     store(weight + m, in_lo ? one - position.fraction : zero);
