@@ -12,7 +12,6 @@ class Tile {
     corners_.take(taps, memory);
   }
 
-  int count() const { return count_; }
   const TapCorners<T>& tap(int64_t index) const {
     return corners_.taps[static_cast<size_t>(index)];
   }
@@ -20,7 +19,6 @@ class Tile {
   // Flat output pixels first .. first+count-1 of image n.
   void place(const View& scale, const T* guide, int64_t n, int64_t first, int count,
              AxisSteps steps_y, AxisSteps steps_x) {
-    count_ = count;
     if (guide == nullptr) steps_y.pixel = steps_x.pixel = 0;
     T scale_y[kTile] = {}, scale_x_own[kTile] = {};
     load_pixels<T>(scale, n, 0, 1, conv_.x.out, first, count, scale_y, 1, 1);
@@ -75,7 +73,6 @@ class Tile {
  private:
   const Conv& conv_;
   const bool narrow_;
-  int count_ = 0;
   AxisTable<T> rows_, columns_;
   CornerTable<T> corners_;
   GuideTile<T> guide_;
