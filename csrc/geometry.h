@@ -37,8 +37,10 @@ struct Axis {
     return std::min(std::max<int64_t>(centre_floor(o), 0), in - 1);
   }
 
-  // A tap of zero offset stays on its pixel whatever the scale: one corner, no derivative.
-  bool fixed(int64_t t) const { return tap_doubled(t) == 0; }
+  // The tap of zero offset, -1 where there is none. It stays on its pixel whatever the scale: one
+  // corner, no derivative.
+  int64_t fixed_tap() const { return kernel % 2 != 0 ? kernel / 2 : -1; }
+  bool fixed(int64_t t) const { return t == fixed_tap(); }
 
   // Largest magnitude a centre or an image border takes: decides the width of index arithmetic.
   int64_t reach() const {

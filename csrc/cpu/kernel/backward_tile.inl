@@ -47,7 +47,7 @@ class BackwardTile {
         plan_(conv),
         blocks_(channel_blocks(plan_, kBlock)),
         units_(make_units(blocks_, kBlock)),
-        taps_(taps_at_once(plan_.taps, std::min(kBlock, to_quads(plan_.channels)))),
+        taps_(taps_at_once(conv, std::min(kBlock, to_quads(plan_.channels)))),
         width_(plan_.depthwise ? plan_.multiplier * kBlock : pad_width<T>(plan_.outputs)),
         ld_rows_(
             pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowPad)) +
@@ -149,7 +149,7 @@ class BackwardTile {
               scatter_tap<T, Writes, S>(scratch.tile.tap(t), read, write, count, block.padded, rows,
                                         ld_rows_, scratch.dot, scratch.dot + kTile * kLanes<T>);
             } else {
-              gather_tap(scratch.tile.tap(t), read, count, block.padded, rows, ld_rows_);
+              gather_tap(scratch.tile.tap(t), read, 0, count, block.padded, rows, ld_rows_);
             }
           }
           if (weight != nullptr) {

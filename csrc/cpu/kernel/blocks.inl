@@ -38,10 +38,14 @@ inline std::vector<ChannelBlock> channel_blocks(const Plan& plan, int64_t most) 
   return blocks;
 }
 
-// Taps gathered at a time: the gathered matrix of a tile should stay in the second-level cache.
-SURFCONV_INLINE int64_t taps_at_once(int64_t taps, int64_t channels) {
-  constexpr int64_t kDepth = 640, kMostTaps = 64;
-  return std::max<int64_t>(1, std::min({taps, kMostTaps, kDepth / std::max<int64_t>(channels, 1)}));
+// Taps gathered at a time, so that the gathered matrix of a tile stays in the second-level cache:
+// whole rows of the kernel, unless a row is longer than anybody's kernel.
+SURFCONV_INLINE int64_t taps_at_once(const Conv& conv, int64_t channels) {
+  constexpr int64_t kDepth = 640;
+  if (!has_whole_rows(conv)) return std::max<int64_t>(1, kDepth / channels);
+  const int64_t most = std::min(kMostTaps, kDepth / std::max<int64_t>(channels, 1));
+  const int64_t rows = std::max<int64_t>(1, most / conv.x.kernel);
+  return std::min(rows, conv.y.kernel) * conv.x.kernel;
 }
 
 // Weights are packed by the loads of pixels: the kernel's taps are the pixels of a small image.

@@ -20,7 +20,7 @@ void depthwise_multiply(const DepthwiseBlock& block, int count, const T* rows, i
         const T* weight =
             weights + block.weight_start + (t * block.multiplier + j) * block.weight_row;
         T* to = out + m * ld_out + j * out_row;
-        for_channels<T>(block.channels, [&](int64_t c, auto lanes) {
+        for_channels<T>(block.channels, [&](int64_t c, auto lanes) SURFCONV_INLINED {
           using V = Vec<T, decltype(lanes)::lanes>;
           store(to + c, V(load<V>(to + c) + load<V>(row + c) * load<V>(weight + c)));
         });
@@ -39,7 +39,7 @@ void depthwise_matrix_gradient(const DepthwiseBlock& block, int count, const T* 
       const T* weight = weights + block.weight_start + t * block.multiplier * block.weight_row;
       const T* from = gradient + m * ld_gradient;
       T* row = rows + m * ld + t * block.channels;
-      for_channels<T>(block.channels, [&](int64_t c, auto lanes) {
+      for_channels<T>(block.channels, [&](int64_t c, auto lanes) SURFCONV_INLINED {
         using V = Vec<T, decltype(lanes)::lanes>;
         V sum{};
         for (int64_t j = 0; j < block.multiplier; ++j) {
@@ -62,7 +62,7 @@ void depthwise_weight_gradient(const DepthwiseBlock& block, int count, const T* 
       for (int64_t j = 0; j < block.multiplier; ++j) {
         const T* from = gradient + m * ld_gradient + j * gradient_row;
         T* to = partial + (t * block.multiplier + j) * block.channels;
-        for_channels<T>(block.channels, [&](int64_t c, auto lanes) {
+        for_channels<T>(block.channels, [&](int64_t c, auto lanes) SURFCONV_INLINED {
           using V = Vec<T, decltype(lanes)::lanes>;
           store(to + c, V(load<V>(to + c) + load<V>(row + c) * load<V>(from + c)));
         });

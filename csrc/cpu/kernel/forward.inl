@@ -9,7 +9,7 @@ class Forward {
         executor_(executor),
         plan_(conv),
         blocks_(channel_blocks(plan_, kBlock)),
-        taps_(taps_at_once(plan_.taps, std::min(kBlock, to_quads(plan_.channels)))),
+        taps_(taps_at_once(conv, std::min(kBlock, to_quads(plan_.channels)))),
         width_(plan_.depthwise ? plan_.multiplier * plan_.row : pad_width<T>(plan_.outputs)),
         ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
         input_(conv, plan_, tensors.input),
@@ -17,6 +17,7 @@ class Forward {
         writes_rows_(!plan_.depthwise && plan_.outputs % kLanes<T> == 0 &&
                      tensors.output.dtype == kComputeDType<T> && tensors.output.c == 1 &&
                      tensors.output.y == tensors.output.x * conv.x.out),
+        prefetches_(plan_.row * static_cast<int64_t>(sizeof(T)) <= 64 && conv.y.kernel > 1),
         unseen_(static_cast<size_t>(plan_.row + kLanes<T>), T(0)) {
     pack_weights();
   }
@@ -118,13 +119,15 @@ class Forward {
     }
     for (int64_t first_tap = 0; first_tap < plan_.taps; first_tap += taps_) {
       const int64_t taps = std::min(taps_, plan_.taps - first_tap);
-      scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
+      if (!scratch.tile.interior()) {
+        scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
+      }
       for (const ChannelBlock& block : blocks_) {
         const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
-        for (int64_t t = 0; t < taps; ++t) {
-          gather_tap(scratch.tile.tap(t), base + channel * bytes, count, block.padded,
-                     scratch.rows + t * block.padded, ld_rows_);
-        }
+        gather_tile(conv_, scratch.tile, first_tap, taps, base + channel * bytes, block.padded,
+                    scratch.rows, ld_rows_);
+        if (prefetches_ && first_tap + taps == plan_.taps)
+          prefetch_ahead(scratch.tile, base, count);
         if (plan_.depthwise) {
           const DepthwiseBlock part{plan_.multiplier, block.padded, taps, plan_.row,
                                     first_tap * plan_.multiplier * plan_.row + block.first};
@@ -156,6 +159,19 @@ class Forward {
     }
   }
 
+  // The rows that the lowest taps of the tiles to come will meet first, while the product is busy:
+  // the processor's own prefetching stops at the gaps between tiles. Neighbours are at like depths.
+  void prefetch_ahead(const Tile<T>& tile, const char* base, int count) const {
+    constexpr int64_t kTilesAhead = 3;
+    const int64_t ahead = kTilesAhead * kTile * conv_.x.stride * input_.step_x();
+    const int64_t* rows = tile.rows().read + (conv_.y.kernel * 2 - 1) * kTile;
+    const int64_t* columns = tile.columns().read + conv_.x.kernel / 2 * 2 * kTile;
+    for (int m = 0; m < count; ++m) {
+      __builtin_prefetch(base + rows[m] + columns[m] + ahead * static_cast<int64_t>(sizeof(T)), 0,
+                         2);
+    }
+  }
+
   const Conv& conv_;
   const ForwardTensors& tensors_;
   const Executor& executor_;
@@ -164,7 +180,7 @@ class Forward {
   const int64_t taps_, width_, ld_rows_;
   InputRows<T> input_;
   GuideRows<T> guide_;
-  const bool writes_rows_;
+  const bool writes_rows_, prefetches_;
   std::vector<T> unseen_;  // what a corner outside the image reads
   std::vector<T> initial_;
   std::unique_ptr<T[]> weights_;

@@ -3,6 +3,10 @@
 // tile's pixels hold the geometry of a scale of zero and are not used.
 constexpr int kTile = 48;
 
+// Taps gathered at a time are whole rows of the kernel where a row has no more taps than this.
+constexpr int64_t kMostTaps = 64;
+SURFCONV_INLINE bool has_whole_rows(const Conv& conv) { return conv.x.kernel <= kMostTaps; }
+
 // Per axis, tap and side (pixel `lo`, then `lo + 1`), one entry for each pixel of the tile.
 template <class T>
 struct AxisTable {
@@ -46,11 +50,14 @@ SURFCONV_INLINE void fill_offsets(const Int* __restrict lo, int sides, int64_t s
   }
 }
 
-// One tap of all pixels: the lower pixel, then weight and presence of both.
+// One tap of all pixels: the lower pixel, then weight and presence of both. lowest: of all weights.
 template <bool Descending, class T, class Int>
 void locate_tile(T half, T tap, Int size, const T* __restrict scale, const Int* __restrict centre,
-                 Int* __restrict lo, T* __restrict weight, T* __restrict inside) {
-  constexpr int lanes = sizeof(T) == sizeof(Int) ? kLanes<T> : 1;
+                 Int* __restrict lo, T* __restrict weight, T* __restrict inside,
+                 T* __restrict lowest) {
+  // g++ 12 takes comparisons of longer vectors apart, lane by lane.
+  constexpr int most = std::min(SURFCONV_VECTOR_BYTES, 32) / static_cast<int>(sizeof(T));
+  constexpr int lanes = sizeof(T) == sizeof(Int) ? most : 1;
   using Real = Vec<T, lanes>;
   using Integer = Vec<Int, lanes>;
   using Mask = decltype(Real{} > Real{});
@@ -68,18 +75,21 @@ void locate_tile(T half, T tap, Int size, const T* __restrict scale, const Int* 
     store(lo + m, at & (lo_in | hi_in));
     store(inside + m, in_lo ? one : zero);
     store(inside + kTile + m, in_hi ? one : zero);
-    store(weight + m, in_lo ? one - position.fraction : zero);
-    store(weight + kTile + m, in_hi ? position.fraction : zero);
+    const Real weight_lo = in_lo ? one - position.fraction : zero;
+    const Real weight_hi = in_hi ? position.fraction : zero;
+    store(weight + m, weight_lo);
+    store(weight + kTile + m, weight_hi);
+    const Real both = weight_lo < weight_hi ? weight_lo : weight_hi;
+    const Real before = load<Real>(lowest + m);
+    store(lowest + m, Real(both < before ? both : before));
   }
 }
 
 template <class T, class Int>
 void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict scale,
-               const int64_t* __restrict wide_centre, const AxisTable<T>& table) {
+               const Int* __restrict centre, const AxisTable<T>& table, T* __restrict lowest) {
   const T half = axis.centre_is_half() ? T(0.5) : T(0);
   const Int size = static_cast<Int>(axis.in);
-  Int centre[kTile];
-  for (int m = 0; m < kTile; ++m) centre[m] = static_cast<Int>(wide_centre[m]);
   for (int64_t t = 0; t < axis.kernel; ++t) {
     const T tap = static_cast<T>(axis.tap_doubled(t)) / 2;
     const int64_t at = t * 2 * kTile;
@@ -91,11 +101,12 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict sca
         const bool in = (centre[m] >= 0) & (centre[m] < size);
         lo[m] = in ? centre[m] : 0;
         weight[m] = inside[m] = in ? T(1) : T(0);
+        lowest[m] = std::min(lowest[m], weight[m]);
       }
     } else if (tap < 0) {
-      locate_tile<true>(half, tap, size, scale, centre, lo, weight, inside);
+      locate_tile<true>(half, tap, size, scale, centre, lo, weight, inside, lowest);
     } else {
-      locate_tile<false>(half, tap, size, scale, centre, lo, weight, inside);
+      locate_tile<false>(half, tap, size, scale, centre, lo, weight, inside, lowest);
     }
     const int sides = axis.fixed(t) ? 1 : 2;
     fill_offsets(lo, sides, steps.read, table.read + at);

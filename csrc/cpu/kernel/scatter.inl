@@ -32,7 +32,7 @@ void scatter_corners(const TapCorners<T>& tap, const char* read_base, char* writ
     }
     T* row = rows + m * ld;
     Vec<T, L> total{}, total_x{};
-    for_channels<T>(channels, [&](int64_t c, auto width) {
+    for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
       constexpr int lanes = decltype(width)::lanes;
       using V = Vec<T, lanes>;
       const V gradient = load<V>(row + c);

@@ -1,4 +1,6 @@
 #define SURFCONV_INLINE inline __attribute__((always_inline))
+// After the parameters of a lambda: in a hot loop g++ sometimes calls it instead.
+#define SURFCONV_INLINED __attribute__((always_inline))
 
 template <class T, int N>
 struct VecOf {
@@ -46,8 +48,23 @@ struct Fixed {
 };
 template <class T, int64_t N, class Body>
 SURFCONV_INLINE void for_channels(Fixed<N>, const Body& body) {
+  constexpr int lanes = N < kLanes<T> ? static_cast<int>(N) : kLanes<T>;
 #pragma GCC unroll 16
-  for (int64_t c = 0; c < N; c += kLanes<T>) body(c, Width<kLanes<T>>{});
+  for (int64_t c = 0; c < N; c += lanes) body(c, Width<lanes>{});
+}
+
+template <int64_t N>
+constexpr int64_t count_of(Fixed<N>) {
+  return N;
+}
+constexpr int64_t count_of(int64_t channels) { return channels; }
+template <class T, int64_t N>
+constexpr bool is_one_vector(Fixed<N>) {
+  return N <= kLanes<T>;
+}
+template <class T>
+constexpr bool is_one_vector(int64_t) {
+  return false;
 }
 
 // Calls body with the count as a Fixed where it is one that nets have in float32.
@@ -57,6 +74,8 @@ SURFCONV_INLINE void with_channels(int64_t channels, const Body& body) {
     if (channels == 64) return body(Fixed<64>{});
     if (channels == 32) return body(Fixed<32>{});
     if (channels == 16) return body(Fixed<16>{});
+    if (channels == 8) return body(Fixed<8>{});
+    if (channels == 4) return body(Fixed<4>{});
   }
   body(channels);
 }
