@@ -2,159 +2,262 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import conv2d
 
-from cases import (
+import cases
+from candidates import (
     BASELINE,
-    DEPTHS,
-    LAYOUTS,
-    PADDING,
-    REFERENCE_DEPTH,
-    SURF_NAMES,
+    CONTINUOUS,
+    LEVELS,
+    SAME_LEVEL,
+    WINDOW,
     Candidate,
-    Shape,
     make_candidate,
-    make_depth,
+    make_conv,
+    make_input,
+    random_like,
+    scene_of,
 )
-from surfconv_ops import SurfConv2d, depth_to_scale, reference, surf_conv2d
+from cases import LAYOUTS, Layer
+from frames import RANDOM, Scene, make_scene, smooth_kinds
+from peers import DEFORM, DeformConv2d, DepthConv2d, GridSampleConv2d, unavailable
+from plan import Plan
+from points import at_points, choose_points, off_kinks
+from surfconv_ops import SurfConv2d, at_output_centers, depth_to_scale, surf_conv2d
+from timing import thread_count
 
-# Rounding of a float32 sum of up to H*W terms; a wrong tap is off by 1e-2 and more.
+#: Relative RMS of float32 sums of up to H * W terms; a wrong tap is off by 1e-2 and more.
 TOLERANCE = 2e-5
-# Closer than this to a pixel, float32 and float64 may take derivatives on different sides of it.
+#: grid_sample and deform_conv2d round a position in the image, not an offset from its centre.
+PEER_TOLERANCE = 2e-4
+#: One rounding at the end of a float32 result, plus the rounding of what the peers share.
+HALF_TOLERANCES = {torch.bfloat16: 2.0**-8, torch.float16: 2.0**-11}
+#: Closer than this to a pixel, float32 and float64 may take derivatives on different sides of it.
 KINK = 1e-4
+PARTS = ("input", "weight", "bias", "scale")
 
 
 @dataclass(frozen=True)
 class Check:
-    """One comparison: relative RMS error against its tolerance."""
+    """One comparison: relative RMS error against what is allowed."""
 
     what: str
     error: float
+    allowed: float = TOLERANCE
 
     @property
     def passed(self) -> bool:
-        return self.error <= TOLERANCE
+        return self.error <= self.allowed
 
 
-def _error(actual: Tensor, expected: Tensor) -> float:
+def relative_rms(actual: Tensor, expected: Tensor) -> float:
+    """RMS of the difference over RMS of what is expected; infinite for NaN."""
     got, want = actual.detach().double(), expected.detach().double()
     difference = (got - want).square().mean().sqrt()
     error = float(difference / want.square().mean().sqrt().clamp_min(1e-30))
     return error if error == error else float("inf")
 
 
-def _off_kinks(scale: Tensor) -> Tensor:
-    """True where no tap of a 3 x 3 kernel lies on a pixel: its offsets are 0 and +-scale."""
-    return (scale - scale.round()).abs() > KINK
+@dataclass
+class Operands:
+    """A layer's arguments to the operator, scale and guide exactly as the layer makes them."""
+
+    layer: Layer
+    leaves: tuple[Tensor, ...]
+    guide: Tensor | None
+    tolerance: float
+
+    def cast(self, dtype: torch.dtype, layout: str = "contiguous") -> Operands:
+        leaves = [leaf.detach().to(dtype, copy=True) for leaf in self.leaves]
+        leaves[:2] = [leaf.contiguous(memory_format=LAYOUTS[layout]) for leaf in leaves[:2]]
+        guide = None if self.guide is None else self.guide.to(dtype)
+        return Operands(
+            self.layer, tuple(leaf.requires_grad_() for leaf in leaves), guide, self.tolerance
+        )
+
+    def output(self) -> Tensor:
+        input, weight, bias, scale = self.leaves
+        return surf_conv2d(
+            input,
+            weight,
+            bias,
+            scale=scale,
+            guide=self.guide,
+            guide_tolerance=self.tolerance,
+            stride=self.layer.stride,
+            padding=self.layer.padding,
+            groups=self.layer.groups,
+        )
+
+    def at(self, points: Tensor) -> Tensor:
+        return at_points(self.layer, points, *self.leaves, self.guide, self.tolerance)
 
 
-def _arguments(candidate: Candidate) -> dict[str, Tensor | None]:
-    """scale and guide exactly as the layer makes them."""
-    module, depth = candidate.module, candidate.depth
-    assert isinstance(module, SurfConv2d)
-    assert depth is not None
-    levels = module.levels
-    guide = levels.assign(depth).float() if module.same_level_only else None
+def _operands(layer: Layer, subject: str, scene: Scene) -> Operands:
+    module = make_candidate(subject, layer, "contiguous", scene).module
+    assert isinstance(module, SurfConv2d) and module.bias is not None
+    depth, levels = scene.depth, module.levels
+    centres = at_output_centers(depth, layer.kernel, layer.stride, layer.padding)
+    scale = depth_to_scale(centres, scene.reference_depth, levels=levels)
+    guide, tolerance = None, 0.0
+    if subject == SAME_LEVEL:
+        assert levels is not None
+        guide = levels.assign(depth).float()
+    elif subject == WINDOW:
+        guide, tolerance = depth.clone(), scene.window
     if guide is not None:
-        guide[guide < 0] = float("nan")
-    return {"scale": depth_to_scale(depth, REFERENCE_DEPTH, levels=levels), "guide": guide}
+        guide[~(depth > 0)] = float("nan")
+    leaves = (make_input(layer, "contiguous"), module.weight, module.bias, scale)
+    return Operands(layer, leaves, guide, tolerance)
 
 
-def _against_reference(shape: Shape, name: str, kind: str) -> list[Check]:
-    """Outputs and all gradients in both layouts against the reference in float64."""
-    base = make_candidate(name, shape, "contiguous", make_depth(shape, kind))
-    extra = _arguments(base)
-    parameters = list(base.module.parameters())
-    inputs = [base.input, *parameters, extra["scale"]]
-    exact = [tensor.detach().double().requires_grad_() for tensor in inputs if tensor is not None]
-    guide = extra["guide"]
-    expected = reference.surf_conv2d(
-        *exact[:3],
-        scale=exact[3],
-        guide=None if guide is None else guide.double(),
-        padding=PADDING,
-    )
-    gradient = torch.randn(expected.shape, generator=torch.Generator().manual_seed(5))
-    wanted = torch.autograd.grad(expected, exact, gradient.double())
-    smooth = _off_kinks(exact[3].detach())
-    checks = []
+def against_relation(layer: Layer, subject: str, scene: Scene) -> list[Check]:
+    """Operator and layer against the relation at chosen pixels, and against float64 everywhere.
+
+    The relation in float64 settles chosen output pixels and all gradients that flow from them. The
+    operator's own float64, held to the same relation, settles the dense output and gradients.
+    """
+    operands = _operands(layer, subject, scene)
+    points = choose_points(layer)
+    image, row, column = points.unbind(1)
+    exact = operands.cast(torch.float64)
+    wanted = exact.at(points)
+    sparse = random_like(wanted)
+    wanted_grads = torch.autograd.grad(wanted, exact.leaves, sparse)
+    dense_output = exact.output()
+    dense = random_like(dense_output)
+    dense_grads = torch.autograd.grad(dense_output, exact.leaves, dense)
+    smooth = off_kinks(layer, exact.leaves[3].detach(), KINK)
+    shown = f"{layer}, {subject}, {scene.kind} depth"
+    checks = [Check(f"{shown}, float64: output", relative_rms(_pick(dense_output, points), wanted))]
     for layout, memory_format in LAYOUTS.items():
-        leaves = [tensor.detach().float() for tensor in exact]
-        leaves[:2] = [leaf.contiguous(memory_format=memory_format) for leaf in leaves[:2]]
-        for leaf in leaves:
-            leaf.requires_grad_()
-        output = surf_conv2d(*leaves[:3], scale=leaves[3], guide=guide, padding=PADDING)
-        shown = f"{shape.name} {name}, {kind} depth, {layout}"
-        checks.append(Check(f"{shown}: output", _error(output, expected.detach())))
-        grads = torch.autograd.grad(
-            output, leaves, gradient.contiguous(memory_format=memory_format)
-        )
-        for part, grad, want in zip(("input", "weight", "bias"), grads, wanted, strict=False):
-            checks.append(Check(f"{shown}: gradient of {part}", _error(grad, want)))
-        checks.append(
-            Check(f"{shown}: gradient of scale", _error(grads[3][smooth], wanted[3][smooth]))
-        )
-        with torch.no_grad():
-            module = make_candidate(name, shape, layout, make_depth(shape, kind))
-            checks.append(Check(f"{shown}: layer", _error(module.forward(), expected.detach())))
+        own = operands.cast(torch.float32, layout)
+        output = own.output()
+        here = f"{shown}, {layout}"
+        checks += [
+            Check(f"{here}: output at points", relative_rms(_pick(output, points), wanted)),
+            Check(f"{here}: output", relative_rms(output, dense_output)),
+        ]
+        scattered = torch.zeros_like(output)
+        scattered[image, :, row, column] = sparse.float()
+        pairs = (("from points", scattered, wanted_grads), ("dense", dense.float(), dense_grads))
+        for how, gradient, expected in pairs:
+            gradient = gradient.contiguous(memory_format=memory_format)
+            grads = torch.autograd.grad(output, own.leaves, gradient, retain_graph=True)
+            for part, grad, want in zip(PARTS, grads, expected, strict=True):
+                if part == "scale":
+                    grad, want = grad[smooth], want[smooth]
+                checks.append(Check(f"{here}: gradient of {part}, {how}", relative_rms(grad, want)))
+        candidate = make_candidate(subject, layer, layout, scene)
+        checks.append(Check(f"{here}: layer", relative_rms(candidate.forward(), output)))
     return checks
 
 
-def _at_scale_one(shape: Shape) -> list[Check]:
-    """At scale 1 the operator is F.conv2d."""
-    candidate = make_candidate(BASELINE, shape, "contiguous", make_depth(shape, "smooth"))
-    weight, bias = candidate.module.parameters()
-    scale = torch.ones(shape.batch, shape.height, shape.width)
-    with torch.no_grad():
-        expected = torch.nn.functional.conv2d(
-            candidate.input.double(), weight.double(), bias.double(), padding=PADDING
-        )
-        actual = surf_conv2d(candidate.input, weight, bias, scale=scale, padding=PADDING)
-    return [Check(f"{shape.name} scale 1 is conv2d", _error(actual, expected))]
+def _pick(output: Tensor, points: Tensor) -> Tensor:
+    image, row, column = points.unbind(1)
+    return output[image, :, row, column]
 
 
-def _same_bits(shape: Shape, threads: tuple[int, ...]) -> list[Check]:
-    """Every thread count gives the same bits."""
-    before = torch.get_num_threads()
+def at_scale_one(layer: Layer) -> list[Check]:
+    """At scale 1 the operator is F.conv2d, output and gradients."""
+    candidate = make_candidate(BASELINE, layer, "contiguous")
+    leaves = [leaf.detach().requires_grad_() for leaf in candidate.leaves()]
+    # conv2d's float32 gradients of weight and bias are themselves off by half the tolerance.
+    exact = [leaf.detach().double().requires_grad_() for leaf in leaves]
+    options = {"stride": layer.stride, "padding": layer.padding, "groups": layer.groups}
+    scale = torch.ones(layer.batch, *layer.output_size)
     results = []
-    try:
-        for count in threads:
-            torch.set_num_threads(count)
-            candidate = make_candidate(
-                SURF_NAMES[0], shape, "contiguous", make_depth(shape, "smooth")
-            )
+    for inputs, output in (
+        (exact, conv2d(*exact, **options)),
+        (leaves, surf_conv2d(*leaves, scale=scale, **options)),
+    ):
+        gradient = random_like(output.float()).to(output.dtype)
+        results.append((output, *torch.autograd.grad(output, inputs, gradient)))
+    return [
+        Check(f"{layer}: at scale 1 conv2d's {what}", relative_rms(got, want))
+        for what, want, got in zip(
+            ("output", *(f"gradient of {part}" for part in PARTS[:3])), *results, strict=True
+        )
+    ]
+
+
+def same_bits(layer: Layer, scene: Scene, threads: Sequence[int]) -> list[Check]:
+    """Every thread count gives the same bits."""
+    results = []
+    for count in threads:
+        with thread_count(count):
+            candidate = make_candidate(CONTINUOUS, layer, "contiguous", scene)
             gradients = candidate.backward()()
             assert isinstance(gradients, tuple)
             results.append([candidate.forward().detach(), *gradients])
-    finally:
-        torch.set_num_threads(before)
     equal = all(
         torch.equal(one, other)
         for result in results[1:]
         for one, other in zip(results[0], result, strict=True)
     )
     shown = ", ".join(str(count) for count in threads)
-    return [Check(f"{shape.name} same bits with {shown} threads", 0.0 if equal else float("inf"))]
+    return [Check(f"{layer}: same bits with {shown} threads", 0.0 if equal else float("inf"))]
 
 
-def gate(shape: Shape, threads: tuple[int, ...], quick: bool) -> list[Check]:
-    """All checks of one shape.
-
-    Args:
-        shape: the timed shape.
-        threads: the timed thread counts.
-        quick: leave out the random depth, and the levels mode that has no guide.
-
-    Returns:
-        The checks, passed or not.
-    """
-    checks = _at_scale_one(shape) + _same_bits(shape, threads)
-    # Levels without a guide differ from continuous mode by the numbers in scale alone.
-    names = (SURF_NAMES[0], SURF_NAMES[-1]) if quick else SURF_NAMES
-    for kind in DEPTHS[:1] if quick else DEPTHS:
-        for name in names:
-            checks += _against_reference(shape, name, kind)
+def half_types(layer: Layer, scene: Scene) -> list[Check]:
+    """bfloat16 and float16 are the float32 result of the rounded operands, rounded once."""
+    checks = []
+    for dtype, allowed in HALF_TOLERANCES.items():
+        rounded = make_candidate(CONTINUOUS, layer, "contiguous", scene, dtype)
+        wide = Candidate(
+            make_candidate(CONTINUOUS, layer, "contiguous", scene, dtype).module.float(),
+            rounded.input.float(),
+            scene.depth,
+        )
+        error = relative_rms(rounded.forward(), wide.forward())
+        checks.append(Check(f"{layer}: {str(dtype).removeprefix('torch.')}", error, allowed))
     return checks
+
+
+def peers_agree(layer: Layer, scene: Scene) -> list[Check]:
+    """The peers compute what SurfConv2d computes, so that their times can be compared."""
+    ours = make_candidate(CONTINUOUS, layer, "contiguous", scene)
+    expected = ours.forward()
+    peers: list[type[DepthConv2d]] = [GridSampleConv2d]
+    if DEFORM not in unavailable():
+        peers.append(DeformConv2d)
+    checks = []
+    for peer in peers:
+        module = make_conv(layer, peer, reference_depth=scene.reference_depth)
+        error = relative_rms(module(ours.input, scene.depth), expected)
+        checks.append(Check(f"{layer}: {peer.__name__} agrees", error, PEER_TOLERANCE))
+    return checks
+
+
+def gate(plan: Plan) -> list[tuple[str, Callable[[], list[Check]]]]:
+    """All checks of a plan, as (label, function) in the order in which they are to run."""
+    smooth = smooth_kinds()[0]
+    main = [cases.MAIN[name] for name in ("A", "D")] if plan.quick else list(cases.MAIN.values())
+    others = [*cases.NET_LAYERS.values(), *cases.GROUPED.values(), *cases.POINTWISE.values()]
+    if not plan.quick:
+        others += cases.SMALL.values()
+    combinations = [(CONTINUOUS, smooth), (SAME_LEVEL, RANDOM)]
+    if not plan.quick:
+        combinations += [(WINDOW, smooth), (LEVELS, RANDOM)]
+    threads = tuple(dict.fromkeys(plan.threads))
+    jobs: list[tuple[str, Callable[[], list[Check]]]] = []
+
+    def add(layer: Layer, function: Callable[..., list[Check]], *arguments: object) -> None:
+        jobs.append((layer.name, lambda: function(layer, *arguments)))
+
+    for layer in (shape.shrunk(plan.shrink) for shape in (*main, *others)):
+        important = layer.name in cases.MAIN
+        add(layer, at_scale_one)
+        add(layer, same_bits, scene_of(layer, make_scene, smooth), threads)
+        for subject, kind in combinations if important else combinations[: 1 if plan.quick else 2]:
+            add(layer, against_relation, subject, scene_of(layer, make_scene, kind))
+    first = main[0].shrunk(plan.shrink)
+    scene = scene_of(first, make_scene, smooth)
+    add(first, half_types, scene)
+    add(first, peers_agree, scene)
+    return jobs

@@ -4,13 +4,29 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+
+import torch
+
+from plan import Limits
+
+#: Past the common rounds, a call sits out once it has used this many times its equal share.
+LARGEST_SHARE = 3.0
+
+
+def quartiles(values: list[float]) -> tuple[float, float]:
+    """First and third quartile; of a single value, that value."""
+    if len(values) < 2:
+        return values[0], values[0]
+    first, _, third = statistics.quantiles(values, n=4, method="inclusive")
+    return first, third
 
 
 @dataclass
 class Timing:
-    """Seconds of each timed call."""
+    """Seconds of each timed call, in the order of the rounds it took part in."""
 
     seconds: list[float] = field(default_factory=list)
 
@@ -20,43 +36,64 @@ class Timing:
 
     @property
     def quartiles(self) -> tuple[float, float]:
-        if len(self.seconds) < 2:
-            return self.median, self.median
-        first, _, third = statistics.quantiles(self.seconds, n=4, method="inclusive")
-        return first, third
+        return quartiles(self.seconds)
+
+
+@contextmanager
+def thread_count(threads: int) -> Iterator[None]:
+    """torch's thread count for the duration."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class Call:
+    """Something to time; `prepare` runs before every call, untimed."""
+
+    run: Callable[[], object]
+    prepare: Callable[[], object] = lambda: None
 
 
 def interleave(
-    calls: Mapping[str, Callable[[], object]],
-    *,
-    rounds: int,
-    budget: float,
-    minimum: int = 3,
-    tick: Callable[[], None] = lambda: None,
+    calls: Mapping[str, Call | Callable[[], object]],
+    limits: Limits,
+    started: float | None = None,
 ) -> dict[str, Timing]:
     """Time every call once a round, after one untimed call each.
 
+    A call that is much slower than the others takes part in the first `limits.minimum` rounds and
+    then sits out when it has used up its share, so that a peer a hundred times slower does not
+    decide how long the run takes.
+
     Args:
         calls: what to time, by name.
-        rounds: rounds at most.
-        budget: seconds that one candidate may use; past it, it sits out the rounds after `minimum`,
-            so that a peer a hundred times slower does not decide how long the run takes.
-        minimum: rounds in which everybody takes part.
-        tick: called after each round.
+        limits: rounds and seconds.
+        started: `time.perf_counter()` when the job began, so that what it took to set it up counts
+            as well; None: now.
 
     Returns:
         The timings by name; the slow ones have fewer.
     """
-    results = {name: Timing() for name in calls}
-    for call in calls.values():
-        call()
-    for number in range(rounds):
-        for name, call in calls.items():
+    begin = time.perf_counter() if started is None else started
+    ready = {name: call if isinstance(call, Call) else Call(call) for name, call in calls.items()}
+    results = {name: Timing() for name in ready}
+    share = LARGEST_SHARE * limits.seconds / len(ready)
+    for call in ready.values():
+        call.prepare()
+        call.run()
+    for number in range(limits.maximum):
+        if number >= limits.minimum and time.perf_counter() - begin > limits.seconds:
+            break
+        for name, call in ready.items():
             seconds = results[name].seconds
-            if number >= minimum and sum(seconds) > budget:
+            if number >= limits.minimum and sum(seconds) > share:
                 continue
+            call.prepare()
             start = time.perf_counter()
-            call()
+            call.run()
             seconds.append(time.perf_counter() - start)
-        tick()
     return results

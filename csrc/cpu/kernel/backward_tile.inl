@@ -48,6 +48,8 @@ class BackwardTile {
         blocks_(channel_blocks(plan_, kBlock)),
         units_(make_units(blocks_, kBlock)),
         taps_(taps_at_once(conv, std::min(kBlock, to_quads(plan_.channels)))),
+        swapped_(!plan_.depthwise &&
+                 round_up(plan_.outputs, kSwappedRows) < pad_width<T>(plan_.outputs)),
         width_(plan_.depthwise ? plan_.multiplier * kBlock : pad_width<T>(plan_.outputs)),
         ld_rows_(
             pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowPad)) +
@@ -61,6 +63,7 @@ class BackwardTile {
   // Elements of the partial grad_weight of a block: rows (tap, channel), padded.
   int64_t weight_elements(const ChannelBlock& block) const {
     if (plan_.depthwise) return plan_.taps * plan_.multiplier * block.padded;
+    if (swapped_) return round_up(plan_.outputs, kSwappedRows) * weight_row(block);
     return round_up(plan_.taps * block.padded, kRowPad) * width_;
   }
   int64_t weight_elements(const Unit& unit) const {
@@ -83,8 +86,9 @@ class BackwardTile {
           }
         } else {
           for (int64_t o = 0; o < plan_.outputs; ++o) {
+            const int64_t column = t * block.padded + c;
             body(block.group * plan_.outputs + o, block.first + c, t,
-                 (t * block.padded + c) * width_ + o);
+                 swapped_ ? o * weight_row(block) + column : column * width_ + o);
           }
         }
       }
@@ -171,6 +175,11 @@ class BackwardTile {
 
  private:
   static constexpr int64_t kBlock = 64;
+  static constexpr int kSwappedRows = 4;
+
+  int64_t weight_row(const ChannelBlock& block) const {
+    return plan_.taps * block.padded + 2 * kLanes<T>;
+  }
 
   int64_t most_groups() const {
     int64_t most = 1;
@@ -259,14 +268,20 @@ class BackwardTile {
                        int64_t first_tap, int64_t taps, int count, T* weight) const {
     const T* from = gradients(scratch, unit, block);
     if (!plan_.depthwise) {
-      const int64_t used = taps * block.padded, rows = round_up(used, kRowPad);
-      if (rows > used) {  // else the rows that pad a block of the product would add what lies there
-        for (int m = 0; m < count; ++m) {
-          std::fill(scratch.rows + m * ld_rows_ + used, scratch.rows + m * ld_rows_ + rows, T(0));
-        }
+      // What pads the matrix would else add whatever lies there.
+      const int64_t used = taps * block.padded;
+      const int64_t padded = swapped_ ? pad_width<T>(used) : round_up(used, kRowPad);
+      for (int m = 0; padded > used && m < count; ++m) {
+        std::fill(scratch.rows + m * ld_rows_ + used, scratch.rows + m * ld_rows_ + padded, T(0));
       }
-      gemm_transposed<T>(rows, plan_.outputs, count, scratch.rows, ld_rows_, from, width_,
-                         weight + first_tap * block.padded * width_, width_);
+      if (swapped_) {
+        gemm_transposed<T, kSwappedRows>(round_up(plan_.outputs, kSwappedRows), used, count, from,
+                                         width_, scratch.rows, ld_rows_,
+                                         weight + first_tap * block.padded, weight_row(block));
+      } else {
+        gemm_transposed<T, kRowPad>(padded, plan_.outputs, count, scratch.rows, ld_rows_, from,
+                                    width_, weight + first_tap * block.padded * width_, width_);
+      }
       return;
     }
     depthwise_weight_gradient<T>(depthwise(block, first_tap, taps), count, scratch.rows, ld_rows_,
@@ -293,7 +308,9 @@ class BackwardTile {
   const Plan plan_;
   const std::vector<ChannelBlock> blocks_;
   const std::vector<Unit> units_;
-  const int64_t taps_, width_, ld_rows_;
+  const int64_t taps_;
+  const bool swapped_;  // partial grad_weight as [output][tap, channel]: few outputs, less padding
+  const int64_t width_, ld_rows_;
   const bool needs_matrix_;
   const std::vector<T> zeros_;
   std::unique_ptr<T[]> weights_;

@@ -55,7 +55,7 @@ template <class T>
 void pack_forward(const View& weight, int64_t kernel_x, const Plan& plan, const ChannelBlock& block,
                   int64_t first_tap, int64_t taps, T* packed) {
   const int64_t depth = taps * block.padded;
-  for_panels<T>(plan.outputs, [&](int64_t column, int64_t columns, bool) {
+  for_panels<T>(plan.outputs, [&](int64_t column, int64_t columns) {
     T* panel = packed + column * depth;
     const int64_t used = std::min(columns, plan.outputs - column);
     for (int64_t c = 0; c < block.padded; ++c) {
@@ -83,7 +83,7 @@ void pack_backward(const View& weight, int64_t kernel_x, const Plan& plan,
   for (int64_t o = 0; o < plan.outputs; ++o) {
     load_pixels<T>(weight, block.group * plan.outputs + o, block.first, block.count, kernel_x,
                    first_tap, taps, row.data(), block.padded, block.padded);
-    for_panels<T>(width, [&](int64_t column, int64_t columns, bool) {
+    for_panels<T>(width, [&](int64_t column, int64_t columns) {
       std::copy_n(row.data() + column, columns, packed + column * plan.outputs + o * columns);
     });
   }

@@ -14,7 +14,7 @@ class Forward {
         ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
         input_(conv, plan_, tensors.input),
         guide_(conv, tensors.guide),
-        writes_rows_(!plan_.depthwise && plan_.outputs % kLanes<T> == 0 &&
+        writes_rows_(!plan_.depthwise && plan_.outputs == width_ &&
                      tensors.output.dtype == kComputeDType<T> && tensors.output.c == 1 &&
                      tensors.output.y == tensors.output.x * conv.x.out),
         prefetches_(plan_.row * static_cast<int64_t>(sizeof(T)) <= 64 && conv.y.kernel > 1),

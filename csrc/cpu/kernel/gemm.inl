@@ -3,11 +3,10 @@
 #define SURFCONV_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5) X(6) X(7) X(8) X(9) X(10) X(11)
 
 // A[row, k] at a[row * lda + k], or with TransposedA at a[row + k * lda].
-template <class T, int ROWS, int VECTORS, bool TransposedA>
+template <class T, int ROWS, int VECTORS, int L, bool TransposedA>
 SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t lda,
                                 const T* __restrict b, int64_t ldb, T* __restrict c, int64_t ldc,
                                 const T* initial) {
-  constexpr int L = kLanes<T>;
   using V = Vec<T, L>;
   const int64_t row_step = TransposedA ? 1 : lda;
   const int64_t depth_step = TransposedA ? lda : 1;
@@ -43,40 +42,59 @@ SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t ld
 #undef SURFCONV_STORE
 }
 
-// Rows of A and C are padded to it, so that there is one block shape for each width.
+// Rows of A and C are padded to it, so that there is one block shape for each width of panel.
 constexpr int64_t kRowPad = 12;
+
+// C's columns are cut into panels of two vectors, and what is left into one of two vectors, one, or
+// half a one: the narrowest that holds it.
+template <class T>
+constexpr int kHalfLanes = kLanes<T> >= 8 ? kLanes<T> / 2 : kLanes<T>;
+template <class T>
+SURFCONV_INLINE int64_t panel_width(int64_t columns_left) {
+  constexpr int64_t L = kLanes<T>, H = kHalfLanes<T>;
+  return columns_left > L ? 2 * L : (columns_left > H ? L : H);
+}
 template <class T>
 SURFCONV_INLINE int64_t pad_width(int64_t width) {
-  return round_up(width, kLanes<T>);
+  const int64_t rest = width % (2 * kLanes<T>);
+  return width - rest + (rest > 0 ? panel_width<T>(rest) : 0);
 }
 
-template <class T, bool TransposedA>
-void gemm_panel(bool wide, int64_t rows, int64_t depth, const T* a, int64_t lda, const T* b,
-                int64_t ldb, T* c, int64_t ldc, const T* initial) {
-  constexpr int R = SURFCONV_GEMM_ROWS, S = SURFCONV_GEMM_NARROW_ROWS;
-  static_assert(kRowPad % R == 0 && kRowPad % S == 0, "whole blocks only");
-  const int64_t row_step = TransposedA ? 1 : lda;
-  if (wide) {
-    for (int64_t r = 0; r < rows; r += R) {
-      gemm_block<T, R, 2, TransposedA>(depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc,
-                                       initial);
-    }
-  } else {
-    for (int64_t r = 0; r < rows; r += S) {
-      gemm_block<T, S, 1, TransposedA>(depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc,
-                                       initial);
-    }
+// body(first column, columns)
+template <class T, class Body>
+SURFCONV_INLINE void for_panels(int64_t width, const Body& body) {
+  for (int64_t column = 0; column < width;) {
+    const int64_t columns = panel_width<T>(width - column);
+    body(column, columns);
+    column += columns;
   }
 }
 
-// The panels of a matrix of `width` columns: pairs of vectors, then a single one where it is left.
-// body(first column, columns, wide)
-template <class T, class Body>
-SURFCONV_INLINE void for_panels(int64_t width, const Body& body) {
-  constexpr int64_t L = kLanes<T>;
-  int64_t column = 0;
-  for (; column + L < width; column += 2 * L) body(column, 2 * L, true);
-  if (column < width) body(column, L, false);
+// MOST: rows of a block at most, a divisor of `rows`.
+template <class T, bool TransposedA, int MOST>
+void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_t lda, const T* b,
+                int64_t ldb, T* c, int64_t ldc, const T* initial) {
+  constexpr int L = kLanes<T>, H = kHalfLanes<T>;
+  constexpr int R = std::min(MOST, SURFCONV_GEMM_ROWS);
+  constexpr int S = std::min(MOST, SURFCONV_GEMM_NARROW_ROWS);
+  static_assert(MOST % R == 0 && MOST % S == 0, "whole blocks only");
+  const int64_t row_step = TransposedA ? 1 : lda;
+  const auto blocks = [&](auto block_rows, auto vectors, auto lanes) {
+    constexpr int N = decltype(block_rows)::value;
+    for (int64_t r = 0; r < rows; r += N) {
+      gemm_block<T, N, decltype(vectors)::value, decltype(lanes)::value, TransposedA>(
+          depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc, initial);
+    }
+  };
+  using One = std::integral_constant<int, 1>;
+  if (columns == 2 * L) {
+    blocks(std::integral_constant<int, R>{}, std::integral_constant<int, 2>{},
+           std::integral_constant<int, L>{});
+  } else if (columns == L) {
+    blocks(std::integral_constant<int, S>{}, One{}, std::integral_constant<int, L>{});
+  } else {
+    blocks(std::integral_constant<int, MOST>{}, One{}, std::integral_constant<int, H>{});
+  }
 }
 
 // B packed panel after panel, each [depth][columns of the panel]; initial: a row of start values
@@ -84,17 +102,18 @@ SURFCONV_INLINE void for_panels(int64_t width, const Body& body) {
 template <class T>
 void gemm_packed(int64_t rows, int64_t width, int64_t depth, const T* a, int64_t lda,
                  const T* packed, T* c, int64_t ldc, const T* initial) {
-  for_panels<T>(width, [&](int64_t column, int64_t columns, bool wide) {
-    gemm_panel<T, false>(wide, rows, depth, a, lda, packed + column * depth, columns, c + column,
-                         ldc, initial != nullptr ? initial + column : nullptr);
+  for_panels<T>(width, [&](int64_t column, int64_t columns) {
+    gemm_panel<T, false, kRowPad>(columns, rows, depth, a, lda, packed + column * depth, columns,
+                                  c + column, ldc, initial != nullptr ? initial + column : nullptr);
   });
 }
 
-// C[rows x width] += A^T * B with A [depth][lda] and B [depth][ldb] as they lie.
-template <class T>
+// C[rows x width] += A^T * B with A [depth][lda] and B [depth][ldb] as they lie; MOST divides rows.
+template <class T, int MOST>
 void gemm_transposed(int64_t rows, int64_t width, int64_t depth, const T* a, int64_t lda,
                      const T* b, int64_t ldb, T* c, int64_t ldc) {
-  for_panels<T>(width, [&](int64_t column, int64_t, bool wide) {
-    gemm_panel<T, true>(wide, rows, depth, a, lda, b + column, ldb, c + column, ldc, nullptr);
+  for_panels<T>(width, [&](int64_t column, int64_t columns) {
+    gemm_panel<T, true, MOST>(columns, rows, depth, a, lda, b + column, ldb, c + column, ldc,
+                              nullptr);
   });
 }
