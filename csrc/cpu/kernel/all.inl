@@ -12,6 +12,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "depthwise.inl"
 #include "gather.inl"
 #include "scatter.inl"
+#include "scatter_interior.inl"
 #include "forward.inl"
 #include "bands.inl"
 #include "gradient_rows.inl"

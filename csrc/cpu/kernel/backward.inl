@@ -129,9 +129,9 @@ class Backward {
     }
     if (tensors_.grad_bias.data != nullptr) target.bias = partial + weight_elements_;
     const bool scatters = grad_input_.needed();
-    const AxisSteps steps_y{input_.step_y() * bytes, 0, conv_.x.in,
+    const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in,
                             scatters ? slot.row_offset.data() : nullptr};
-    const AxisSteps steps_x{input_.step_x() * bytes, tile_.plan().row * bytes, 1};
+    const AxisSteps steps_x{input_.step_x() * bytes, 1};
     target.first_pixel = pass.out.begin * conv_.x.out;
     target.pixels = pass.out.count() * conv_.x.out;
     for (int64_t i = slot.first_image; i < slot.first_image + slot.images; ++i) {

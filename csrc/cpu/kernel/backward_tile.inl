@@ -138,23 +138,24 @@ class BackwardTile {
       with_needs(target, [&](auto writes, auto slopes) {
         constexpr bool Writes = decltype(writes)::value;
         constexpr Slopes S = decltype(slopes)::value;
-        scratch.tile.template fill_taps<Writes, S>(first_tap, taps, unseen_read, unseen_write);
+        if (!scratch.tile.interior()) {
+          scratch.tile.template fill_taps<Writes, S>(first_tap, taps, unseen_read, unseen_write);
+        }
         T* weight = target.weight;
         for (const ChannelBlock& block : unit.blocks) {
           const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
           if (needs_matrix_) matrix_gradient(scratch, unit, block, first_tap, taps, count);
-          for (int64_t t = 0; t < taps; ++t) {
-            T* rows = scratch.rows + t * block.padded;
-            const char* read = target.input + channel * static_cast<int64_t>(sizeof(T));
+          const char* read = target.input + channel * static_cast<int64_t>(sizeof(T));
+          if constexpr (Writes || S != Slopes::none) {
             char* write = nullptr;
             if constexpr (Writes)
               write = target.grad_input + channel * static_cast<int64_t>(sizeof(T));
-            if constexpr (Writes || S != Slopes::none) {
-              scatter_tap<T, Writes, S>(scratch.tile.tap(t), read, write, count, block.padded, rows,
-                                        ld_rows_, scratch.dot, scratch.dot + kTile * kLanes<T>);
-            } else {
-              gather_tap(scratch.tile.tap(t), read, 0, count, block.padded, rows, ld_rows_);
-            }
+            const ScatterTarget<T> to{read, write, scratch.dot, scratch.dot + kTile * kLanes<T>};
+            scatter_tile<Writes, S>(conv_, scratch.tile, first_tap, taps, to, block.padded,
+                                    scratch.rows, ld_rows_);
+          } else {
+            gather_tile(conv_, scratch.tile, first_tap, taps, read, block.padded, scratch.rows,
+                        ld_rows_);
           }
           if (weight != nullptr) {
             weight_gradient(scratch, unit, block, first_tap, taps, count, weight);

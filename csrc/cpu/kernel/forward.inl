@@ -102,8 +102,8 @@ class Forward {
     constexpr int64_t bytes = sizeof(T);
     const char* base = input_.image(pass, n);
     const int64_t unseen = byte_distance(base, unseen_.data());
-    const AxisSteps steps_y{input_.step_y() * bytes, 0, conv_.x.in};
-    const AxisSteps steps_x{input_.step_x() * bytes, 0, 1};
+    const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in};
+    const AxisSteps steps_x{input_.step_x() * bytes, 1};
     scratch.tile.place(tensors_.scale, guide_.image(pass, n), n, begin, count, steps_y, steps_x);
     // Straight into the output where whole blocks of the product fit there.
     const bool direct = writes_rows_ && count % kRowPad == 0;

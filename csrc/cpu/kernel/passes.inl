@@ -81,7 +81,8 @@ inline int64_t most_rows(const std::vector<Pass>& passes) {
   return most;
 }
 
-// The input as channel-innermost rows: in place where it lies so already, else packed.
+// The input as channel-innermost rows: in place where it lies so already, pixel after pixel, else
+// packed.
 template <class T>
 class InputRows {
  public:
@@ -89,12 +90,12 @@ class InputRows {
       : conv_(conv),
         plan_(plan),
         input_(input),
-        packed_(
-            !(input.dtype == kComputeDType<T> && plan.row == conv.in_channels && input.c == 1)) {}
+        packed_(!(input.dtype == kComputeDType<T> && plan.row == conv.in_channels && input.c == 1 &&
+                  input.x == plan.row)) {}
 
   bool packed() const { return packed_; }
   int64_t row_elements() const { return conv_.x.in * plan_.row; }
-  int64_t step_x() const { return packed_ ? plan_.row : input_.x; }
+  int64_t step_x() const { return plan_.row; }
   int64_t step_y() const { return packed_ ? row_elements() : input_.y; }
 
   void reserve(const std::vector<Pass>& passes) {

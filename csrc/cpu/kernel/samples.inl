@@ -13,7 +13,7 @@ struct AxisTable {
   T* weight;       // 0 outside the image
   T* inside;       // 1 inside the image, else 0
   int64_t* read;   // byte offset in the input
-  int64_t* write;  // byte offset in the gradient of the input
+  int64_t* write;  // of rows: byte offset in the gradient of the input; columns lie as in the input
   int64_t* pixel;  // this axis' share of the flat pixel number
 
   static int64_t entries(const Axis& axis) { return axis.kernel * 2 * kTile; }
@@ -29,9 +29,9 @@ struct AxisTable {
   }
 };
 
-// Byte steps of an axis. Rows of the gradient may lie apart: then write_rows lists them.
+// Byte steps of an axis. Rows of the gradient may lie apart: write_rows lists them.
 struct AxisSteps {
-  int64_t read = 0, write = 0, pixel = 0;
+  int64_t read = 0, pixel = 0;
   const int64_t* write_rows = nullptr;
 };
 
@@ -119,8 +119,6 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict sca
               in ? steps.write_rows[static_cast<int64_t>(lo[m]) + side] : 0;
         }
       }
-    } else if (steps.write != 0) {
-      fill_offsets(lo, sides, steps.write, table.write + at);
     }
   }
 }
@@ -246,10 +244,9 @@ void fill_corners(const Conv& conv, int64_t ty, int64_t tx, const AxisTable<T>& 
       }
       if constexpr (Writes) {
         const int64_t* __restrict write_y = rows.write + at_y;
-        const int64_t* __restrict write_x = columns.write + at_x;
         int64_t* __restrict write = tap.write + corner;
         for (int m = 0; m < kTile; ++m) {
-          write[m] = weight[m] != 0 ? write_y[m] + write_x[m] : unseen_write;
+          write[m] = weight[m] != 0 ? write_y[m] + read_x[m] : unseen_write;
         }
       }
     }

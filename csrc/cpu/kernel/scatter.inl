@@ -1,77 +1,116 @@
-// total += a * b in a register; the narrower vectors of a channel tail add to memory.
-template <bool InRegister, class T, class V, class Total>
-SURFCONV_INLINE void add_product(Total& total, T* memory, V a, V b) {
-  if constexpr (InRegister) {
-    total += a * b;
-  } else {
-    store(memory, V(load<V>(memory) + a * b));
-  }
-}
-
-// The backward pass over one tap of a tile. `rows` holds the gradient of the gathered matrix and is
-// overwritten by the gathered matrix itself, which the weight's gradient needs next.
+// The backward pass over the taps of a tile. The matrix holds the gradient of the gathered matrix
+// and is overwritten by the gathered matrix itself, which the weight's gradient needs next.
 //   grad_input[corner] += weight * gradient          (Writes)
 //   dot[m]             += gradient * d(sample)/d(scale), one vector of partial sums a pixel (S)
-// With Kinked, corners of zero weight hold a real pixel for the derivative's sake and must not
-// touch the sample: 0 * inf.
-template <class T, int CORNERS, bool Writes, Slopes S, bool Kinked, class Channels>
-void scatter_corners(const TapCorners<T>& tap, const char* read_base, char* write_base, int count,
-                     Channels channels, T* __restrict rows, int64_t ld, T* dot, T* dot_x) {
-  constexpr int L = kLanes<T>;
-  for (int m = 0; m < count; ++m) {
+// dot and dot_x (of scale_x, where there are two components) hold kLanes sums for each pixel.
+template <class T>
+struct ScatterTarget {
+  const char* read;  // input
+  char* write;       // its gradient
+  T* dot;
+  T* dot_x;
+};
+
+// A pixel's partial sums while its taps are walked: in a register; the narrower vectors of a
+// channel tail add to memory.
+template <class T, class Channels>
+class PixelDot {
+ public:
+  PixelDot(const ScatterTarget<T>& target, int m)
+      : dot_(target.dot + m * kLanes<T>), dot_x_(target.dot_x + m * kLanes<T>) {}
+
+  // along: d(sample)/d(scale), or of its y component; along_x: of its x component
+  template <class V>
+  SURFCONV_INLINE void add(V along, V gradient) {
+    add_to(total_, dot_, along, gradient);
+  }
+  template <class V>
+  SURFCONV_INLINE void add_x(V along_x, V gradient) {
+    add_to(total_x_, dot_x_, along_x, gradient);
+  }
+  SURFCONV_INLINE void finish() const { store(dot_, Full(load<Full>(dot_) + total_)); }
+  SURFCONV_INLINE void finish_x() const { store(dot_x_, Full(load<Full>(dot_x_) + total_x_)); }
+
+ private:
+  using Full = Vec<T, widest_lanes<T>(Channels{})>;
+
+  template <class V>
+  static SURFCONV_INLINE void add_to(Full& total, T* memory, V along, V gradient) {
+    if constexpr (sizeof(V) == sizeof(Full)) {
+      total += along * gradient;
+    } else {
+      store(memory, V(load<V>(memory) + along * gradient));
+    }
+  }
+
+  Full total_{}, total_x_{};
+  T* dot_;
+  T* dot_x_;
+};
+
+// One tap of one pixel from the weight and slope of each corner. With Kinked, corners of zero
+// weight hold a real pixel for the derivative's sake and must not touch the sample: 0 * inf.
+template <int CORNERS, bool Writes, Slopes S, bool Kinked, class T, class Channels, class Dot>
+SURFCONV_INLINE void scatter_corners(const T* const* from, T* const* to, const T* weight,
+                                     const T* slope, const T* slope_x, Channels channels, T* row,
+                                     Dot& dot) {
+  for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
+    using V = Vec<T, decltype(width)::lanes>;
+    const V gradient = load<V>(row + c);
+    V sample{}, along{}, along_x{};
+#pragma GCC unroll 4
+    for (int q = 0; q < CORNERS; ++q) {
+      const V x = load<V>(from[q] + c);
+      if constexpr (Kinked) {
+        if (weight[q] != 0) sample += x * weight[q];
+      } else {
+        sample += x * weight[q];
+      }
+      if constexpr (S != Slopes::none) along += x * slope[q];
+      if constexpr (S == Slopes::two) along_x += x * slope_x[q];
+    }
+    if constexpr (S != Slopes::none) dot.add(along, gradient);
+    if constexpr (S == Slopes::two) dot.add_x(along_x, gradient);
+    if constexpr (Writes) {
+#pragma GCC unroll 4
+      for (int q = 0; q < CORNERS; ++q) {
+        store(to[q] + c, V(load<V>(to[q] + c) + gradient * weight[q]));
+      }
+    }
+    store(row + c, sample);
+  });
+}
+
+// Pixels begin .. end-1 of one tap by its corner table.
+template <int CORNERS, bool Writes, Slopes S, bool Kinked, class T, class Channels>
+void scatter_run(const TapCorners<T>& tap, const ScatterTarget<T>& target, int begin, int end,
+                 Channels channels, T* matrix, int64_t ld) {
+  for (int m = begin; m < end; ++m) {
     const T* from[CORNERS];
     T* to[CORNERS];
     T weight[CORNERS], slope[CORNERS], slope_x[CORNERS];
 #pragma GCC unroll 4
     for (int q = 0; q < CORNERS; ++q) {
-      from[q] = reinterpret_cast<const T*>(read_base + tap.read[q * kTile + m]);
+      from[q] = reinterpret_cast<const T*>(target.read + tap.read[q * kTile + m]);
       weight[q] = tap.weight[q * kTile + m];
-      if constexpr (Writes) to[q] = reinterpret_cast<T*>(write_base + tap.write[q * kTile + m]);
+      if constexpr (Writes) to[q] = reinterpret_cast<T*>(target.write + tap.write[q * kTile + m]);
       if constexpr (S != Slopes::none) slope[q] = tap.slope[q * kTile + m];
       if constexpr (S == Slopes::two) slope_x[q] = tap.slope_x[q * kTile + m];
     }
-    T* row = rows + m * ld;
-    Vec<T, L> total{}, total_x{};
-    for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-      constexpr int lanes = decltype(width)::lanes;
-      using V = Vec<T, lanes>;
-      const V gradient = load<V>(row + c);
-      V sample{}, along{}, along_x{};
-#pragma GCC unroll 4
-      for (int q = 0; q < CORNERS; ++q) {
-        const V x = load<V>(from[q] + c);
-        if constexpr (Kinked) {
-          if (weight[q] != 0) sample += x * weight[q];
-        } else {
-          sample += x * weight[q];
-        }
-        if constexpr (S != Slopes::none) along += x * slope[q];
-        if constexpr (S == Slopes::two) along_x += x * slope_x[q];
-      }
-      if constexpr (S != Slopes::none) add_product<lanes == L>(total, dot + m * L, along, gradient);
-      if constexpr (S == Slopes::two) {
-        add_product<lanes == L>(total_x, dot_x + m * L, along_x, gradient);
-      }
-      if constexpr (Writes) {
-#pragma GCC unroll 4
-        for (int q = 0; q < CORNERS; ++q) {
-          store(to[q] + c, V(load<V>(to[q] + c) + gradient * weight[q]));
-        }
-      }
-      store(row + c, sample);
-    });
-    using Full = Vec<T, L>;
-    if constexpr (S != Slopes::none) store(dot + m * L, Full(load<Full>(dot + m * L) + total));
-    if constexpr (S == Slopes::two) store(dot_x + m * L, Full(load<Full>(dot_x + m * L) + total_x));
+    PixelDot<T, Channels> dot(target, m);
+    scatter_corners<CORNERS, Writes, S, Kinked>(from, to, weight, slope, slope_x, channels,
+                                                matrix + m * ld, dot);
+    if constexpr (S != Slopes::none) dot.finish();
+    if constexpr (S == Slopes::two) dot.finish_x();
   }
 }
 
-template <class T, bool Writes, Slopes S>
-void scatter_tap(const TapCorners<T>& tap, const char* read_base, char* write_base, int count,
-                 int64_t channels, T* rows, int64_t ld, T* dot, T* dot_x) {
+template <bool Writes, Slopes S, class T>
+void scatter_tap(const TapCorners<T>& tap, const ScatterTarget<T>& target, int begin, int end,
+                 int64_t channels, T* matrix, int64_t ld) {
   const auto run = [&](auto corners, auto kinked, auto known) {
-    scatter_corners<T, decltype(corners)::value, Writes, S, decltype(kinked)::value>(
-        tap, read_base, write_base, count, known, rows, ld, dot, dot_x);
+    scatter_run<decltype(corners)::value, Writes, S, decltype(kinked)::value>(
+        tap, target, begin, end, known, matrix, ld);
   };
   const auto by_kink = [&](auto corners) {
     if constexpr (S != Slopes::none) {

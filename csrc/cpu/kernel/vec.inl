@@ -67,6 +67,16 @@ constexpr bool is_one_vector(int64_t) {
   return false;
 }
 
+// Lanes of the vectors that most of the channels are walked in.
+template <class T, int64_t N>
+constexpr int widest_lanes(Fixed<N>) {
+  return static_cast<int>(std::min<int64_t>(N, kLanes<T>));
+}
+template <class T>
+constexpr int widest_lanes(int64_t) {
+  return kLanes<T>;
+}
+
 // Calls body with the count as a Fixed where it is one that nets have in float32.
 template <class T, class Body>
 SURFCONV_INLINE void with_channels(int64_t channels, const Body& body) {
