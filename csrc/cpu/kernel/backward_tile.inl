@@ -48,9 +48,9 @@ class BackwardTile {
         blocks_(channel_blocks(plan_, kBlock)),
         units_(make_units(blocks_, kBlock)),
         taps_(taps_at_once(conv, std::min(kBlock, to_quads(plan_.channels)))),
-        swapped_(!plan_.depthwise &&
+        swapped_(!plan_.lanewise &&
                  round_up(plan_.outputs, kSwappedRows) < pad_width<T>(plan_.outputs)),
-        width_(plan_.depthwise ? plan_.multiplier * kBlock : pad_width<T>(plan_.outputs)),
+        width_(plan_.lanewise ? plan_.multiplier * kBlock : pad_width<T>(plan_.outputs)),
         ld_rows_(
             pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowPad)) +
             16),
@@ -62,7 +62,7 @@ class BackwardTile {
 
   // Elements of the partial grad_weight of a block: rows (tap, channel), padded.
   int64_t weight_elements(const ChannelBlock& block) const {
-    if (plan_.depthwise) return plan_.taps * plan_.multiplier * block.padded;
+    if (plan_.lanewise) return plan_.taps * plan_.weights_of_tap() * block.padded;
     if (swapped_) return round_up(plan_.outputs, kSwappedRows) * weight_row(block);
     return round_up(plan_.taps * block.padded, kRowPad) * width_;
   }
@@ -77,19 +77,22 @@ class BackwardTile {
   // body(output, channel of the group, tap, index)
   template <class Body>
   void for_weights(const ChannelBlock& block, const Body& body) const {
+    if (plan_.lanewise) {
+      for_lane_weights<false>(conv_, plan_, [&](int64_t o, int64_t c, int64_t k, int64_t lane) {
+        const int64_t at = lane - block.first;
+        if (at < 0 || at >= block.padded) return;
+        for (int64_t t = 0; t < plan_.taps; ++t) {
+          body(o, c, t, (t * plan_.weights_of_tap() + k) * block.padded + at);
+        }
+      });
+      return;
+    }
     for (int64_t t = 0; t < plan_.taps; ++t) {
       for (int64_t c = 0; c < block.count; ++c) {
-        if (plan_.depthwise) {
-          for (int64_t j = 0; j < plan_.multiplier; ++j) {
-            body((block.first + c) * plan_.multiplier + j, 0, t,
-                 (t * plan_.multiplier + j) * block.padded + c);
-          }
-        } else {
-          for (int64_t o = 0; o < plan_.outputs; ++o) {
-            const int64_t column = t * block.padded + c;
-            body(block.group * plan_.outputs + o, block.first + c, t,
-                 swapped_ ? o * weight_row(block) + column : column * width_ + o);
-          }
+        const int64_t column = t * block.padded + c;
+        for (int64_t o = 0; o < plan_.outputs; ++o) {
+          body(block.group * plan_.outputs + o, block.first + c, t,
+               swapped_ ? o * weight_row(block) + column : column * width_ + o);
         }
       }
     }
@@ -97,9 +100,9 @@ class BackwardTile {
 
   void pack_weights(const Executor& executor) {
     if (!needs_matrix_) return;
-    if (plan_.depthwise) {
-      weights_.reset(new T[static_cast<size_t>(plan_.taps * plan_.multiplier * plan_.row)]);
-      return pack_depthwise(tensors_.weight, conv_.x.kernel, plan_, weights_.get());
+    if (plan_.lanewise) {
+      weights_ = pack_lanewise<T, true>(conv_, plan_, tensors_.weight);
+      return;
     }
     const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
     const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
@@ -210,16 +213,13 @@ class BackwardTile {
 
   void load_gradients(Scratch& scratch, const Unit& unit, int64_t n, int64_t begin,
                       int count) const {
-    if (plan_.depthwise) {
-      // [pixel][multiplier][kBlock]: a unit of depthwise channels is one block.
+    if (plan_.lanewise) {
+      // [pixel][multiplier][kBlock]: a unit of lanes is one block.
       const ChannelBlock& block = unit.blocks.front();
-      View view = tensors_.grad_output;
-      view.c *= plan_.multiplier;
       for (int64_t j = 0; j < plan_.multiplier; ++j) {
-        View plane = view;
-        advance(plane, j * tensors_.grad_output.c);
-        load_pixels<T>(plane, n, block.first, block.count, conv_.x.out, begin, count,
-                       scratch.grad_out + j * kBlock, width_, block.padded);
+        load_lanes<T>(multiplied(tensors_.grad_output, plan_, j), plan_.out, n, block.first,
+                      block.padded, conv_.x.out, begin, count, scratch.grad_out + j * kBlock,
+                      width_);
       }
       return;
     }
@@ -233,14 +233,15 @@ class BackwardTile {
   void add_bias(Scratch& scratch, const Unit& unit, int count, T* bias) const {
     for (const ChannelBlock& block : unit.blocks) {
       const T* from = gradients(scratch, unit, block);
-      if (plan_.depthwise) {
-        for (int m = 0; m < count; ++m) {
-          for (int64_t j = 0; j < plan_.multiplier; ++j) {
-            for (int64_t c = 0; c < block.count; ++c) {
-              bias[(block.first + c) * plan_.multiplier + j] += from[m * width_ + j * kBlock + c];
-            }
-          }
-        }
+      if (plan_.lanewise) {
+        for_lane_weights<false>(conv_, plan_, [&](int64_t o, int64_t c, int64_t k, int64_t lane) {
+          const int64_t at = lane - block.first;
+          if (c != 0 || at < 0 || at >= block.padded) return;
+          const T* lanes = from + at + (plan_.mix == 1 ? k * kBlock : 0);
+          T sum = 0;
+          for (int m = 0; m < count; ++m) sum += lanes[m * width_];
+          bias[o] += sum;
+        });
       } else if (block.first == 0) {
         T* to = bias + block.group * plan_.outputs;
         for (int m = 0; m < count; ++m) {
@@ -253,7 +254,7 @@ class BackwardTile {
   void matrix_gradient(Scratch& scratch, const Unit& unit, const ChannelBlock& block,
                        int64_t first_tap, int64_t taps, int count) const {
     const T* from = gradients(scratch, unit, block);
-    if (!plan_.depthwise) {
+    if (!plan_.lanewise) {
       const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
       const int64_t index = (&block - unit.blocks.data()) + block_index(unit);
       gemm_packed<T>(round_up(count, kRowPad), taps * block.padded, plan_.outputs, from, width_,
@@ -261,14 +262,17 @@ class BackwardTile {
                      scratch.rows, ld_rows_, zeros_.data());
       return;
     }
-    depthwise_matrix_gradient<T>(depthwise(block, first_tap, taps), count, from, width_, kBlock,
-                                 weights_.get(), scratch.rows, ld_rows_);
+    with_mix<T>(plan_, [&](auto mix) {
+      lane_matrix_gradient<decltype(mix)::value>(lane_block(plan_, block, first_tap, taps), count,
+                                                 from, width_, kBlock, weights_.get(), scratch.rows,
+                                                 ld_rows_);
+    });
   }
 
   void weight_gradient(Scratch& scratch, const Unit& unit, const ChannelBlock& block,
                        int64_t first_tap, int64_t taps, int count, T* weight) const {
     const T* from = gradients(scratch, unit, block);
-    if (!plan_.depthwise) {
+    if (!plan_.lanewise) {
       // What pads the matrix would else add whatever lies there.
       const int64_t used = taps * block.padded;
       const int64_t padded = swapped_ ? pad_width<T>(used) : round_up(used, kRowPad);
@@ -285,14 +289,11 @@ class BackwardTile {
       }
       return;
     }
-    depthwise_weight_gradient<T>(depthwise(block, first_tap, taps), count, scratch.rows, ld_rows_,
-                                 from, width_, kBlock,
-                                 weight + first_tap * plan_.multiplier * block.padded);
-  }
-
-  DepthwiseBlock depthwise(const ChannelBlock& block, int64_t first_tap, int64_t taps) const {
-    return {plan_.multiplier, block.padded, taps, plan_.row,
-            first_tap * plan_.multiplier * plan_.row + block.first};
+    with_mix<T>(plan_, [&](auto mix) {
+      lane_weight_gradient<decltype(mix)::value>(
+          lane_block(plan_, block, first_tap, taps), count, scratch.rows, ld_rows_, from, width_,
+          kBlock, weight + first_tap * plan_.weights_of_tap() * block.padded);
+    });
   }
 
   int64_t block_index(const Unit& unit) const {

@@ -1,25 +1,76 @@
+// How the channels of a tensor lie in working memory: each of its parts padded to quads.
+struct Lanes {
+  int64_t parts, each;
+
+  // Parts that need no padding are one.
+  Lanes(int64_t count, int64_t channels)
+      : parts(channels % kQuad == 0 ? 1 : count),
+        each(channels % kQuad == 0 ? count * channels : channels) {}
+  int64_t padded() const { return to_quads(each); }
+  int64_t row() const { return parts * padded(); }
+};
+
+// Lanes first .. first+lanes-1, from the start of a part, of the pixels begin .. begin+count-1.
+template <class T>
+void load_lanes(const View& view, const Lanes& layout, int64_t n, int64_t first, int64_t lanes,
+                int64_t width, int64_t begin, int64_t count, T* to, int64_t ld) {
+  if (layout.parts == 1) {
+    const int64_t channels = std::min(lanes, layout.each - first);
+    return load_pixels<T>(view, n, first, channels, width, begin, count, to, ld, lanes);
+  }
+  const int64_t padded = layout.padded();
+  for (int64_t lane = first; lane < first + lanes; lane += padded) {
+    load_pixels<T>(view, n, lane / padded * layout.each, layout.each, width, begin, count,
+                   to + (lane - first), ld, padded);
+  }
+}
+
+// All lanes.
+template <class T>
+void store_lanes(const View& view, const Lanes& layout, int64_t n, int64_t width, int64_t begin,
+                 int64_t count, const T* from, int64_t ld) {
+  for (int64_t part = 0; part < layout.parts; ++part) {
+    store_pixels<T>(view, n, part * layout.each, layout.each, width, begin, count,
+                    from + part * layout.padded(), ld);
+  }
+}
+
 // How the contraction over (tap, channel) is cut, and the weights packed to match.
 //
-// Dense: each group is a matrix product. Depthwise (one input channel a group): all channels form
-// one group whose contraction is element by element, once for each of `multiplier` outputs.
+// Dense: each group is a matrix product. Lanewise: groups of one input channel, or of up to four
+// channels and outputs, are contracted element by element, all at once; see lanewise.inl.
 struct Plan {
-  bool depthwise;
-  int64_t groups;      // matrix products of a tile
-  int64_t channels;    // input channels of each
-  int64_t outputs;     // output channels of each; depthwise: channels
+  bool lanewise;
+  int mix;             // lanewise: lanes that meet each other, 1 or kQuad
   int64_t multiplier;  // depthwise: outputs of one channel; else 1
+  int64_t groups;      // dense: matrix products of a tile; lanewise: 1
+  int64_t channels;    // input channels of each; lanewise: lanes
+  int64_t outputs;     // output channels of each; lanewise: lanes
   int64_t taps;
-  int64_t row;  // channels of a pixel in working memory, each group padded to quads
+  Lanes in, out;
+  int64_t row;  // lanes of an input pixel
 
-  explicit Plan(const Conv& conv) {
-    depthwise = conv.groups > 1 && conv.groups == conv.in_channels;
-    groups = depthwise ? 1 : conv.groups;
-    channels = conv.in_channels / groups;
-    multiplier = depthwise ? conv.out_channels / conv.in_channels : 1;
-    outputs = depthwise ? channels : conv.out_channels / groups;
+  explicit Plan(const Conv& conv)
+      : in(conv.groups, conv.in_channels / conv.groups),
+        out(conv.groups, conv.out_channels / conv.groups) {
+    const int64_t inputs = conv.in_channels / conv.groups;
+    outputs = conv.out_channels / conv.groups;
+    const bool depthwise = conv.groups > 1 && inputs == 1;
+    // Two lanes of double are no quad.
+    const bool quads = conv.groups > 1 && inputs <= kQuad && outputs <= kQuad && kLanes<double> > 2;
+    lanewise = depthwise || quads;
+    mix = lanewise && !depthwise ? static_cast<int>(kQuad) : 1;
+    multiplier = depthwise ? outputs : 1;
+    if (depthwise) in = out = Lanes(1, conv.in_channels);
+    row = in.row();
+    groups = lanewise ? 1 : conv.groups;
+    channels = lanewise ? row : inputs;
+    if (lanewise) outputs = row;
     taps = conv.y.kernel * conv.x.kernel;
-    row = groups * to_quads(channels);
   }
+
+  // Lanewise: weight vectors of a tap.
+  int64_t weights_of_tap() const { return multiplier * mix; }
 };
 
 // A run of channels of one group.
@@ -89,14 +140,63 @@ void pack_backward(const View& weight, int64_t kernel_x, const Plan& plan,
   }
 }
 
-// Depthwise weights as [tap][multiplier][row].
-template <class T>
-void pack_depthwise(const View& weight, int64_t kernel_x, const Plan& plan, T* packed) {
-  for (int64_t j = 0; j < plan.multiplier; ++j) {
-    View filter = weight;
-    advance(filter, j * weight.n);
-    filter.c = weight.n * plan.multiplier;
-    load_pixels<T>(filter, 0, 0, plan.channels, kernel_x, 0, plan.taps, packed + j * plan.row,
-                   plan.multiplier * plan.row, plan.row);
+// Lanewise: body(output, channel of the group, k, lane) for every weight of a tap. Lanes are those
+// of the output, so that sums over k are outputs, or with Back those of the input.
+template <bool Back, class Body>
+SURFCONV_INLINE void for_lane_weights(const Conv& conv, const Plan& plan, const Body& body) {
+  if (plan.mix == 1) {
+    for (int64_t o = 0; o < conv.out_channels; ++o) {
+      body(o, int64_t{0}, o % plan.multiplier, o / plan.multiplier);
+    }
+    return;
   }
+  const int64_t inputs = conv.in_channels / conv.groups, outputs = conv.out_channels / conv.groups;
+  for (int64_t o = 0; o < conv.out_channels; ++o) {
+    for (int64_t c = 0; c < inputs; ++c) {
+      const int64_t quad = o / outputs * kQuad, of_out = o % outputs;
+      body(o, c, Back ? of_out : c, quad + (Back ? c : of_out));
+    }
+  }
+}
+
+// Weights as [tap][k][row].
+template <class T, bool Back>
+std::unique_ptr<T[]> pack_lanewise(const Conv& conv, const Plan& plan, const View& weight) {
+  const int64_t step = plan.weights_of_tap() * plan.row;
+  std::unique_ptr<T[]> packed(new T[static_cast<size_t>(plan.taps * step)]());
+  visit_storage<T>(weight, [&](auto* data) {
+    for_lane_weights<Back>(conv, plan, [&](int64_t o, int64_t c, int64_t k, int64_t lane) {
+      const auto* filter = data + o * weight.n + c * weight.c;
+      T* to = packed.get() + k * plan.row + lane;
+      for (int64_t ty = 0; ty < conv.y.kernel; ++ty) {
+        for (int64_t tx = 0; tx < conv.x.kernel; ++tx, to += step) {
+          *to = widen(filter[ty * weight.y + tx * weight.x]);
+        }
+      }
+    });
+  });
+  return packed;
+}
+
+inline LaneBlock lane_block(const Plan& plan, const ChannelBlock& block, int64_t first_tap,
+                            int64_t taps) {
+  return {block.padded, taps, plan.row, first_tap * plan.weights_of_tap() * plan.row + block.first,
+          plan.multiplier};
+}
+
+// The channels that are output j of each input channel.
+inline View multiplied(const View& view, const Plan& plan, int64_t j) {
+  View plane = view;
+  advance(plane, j * view.c);
+  plane.c *= plan.multiplier;
+  return plane;
+}
+
+// body(mix) with the plan's mix as a constant.
+template <class T, class Body>
+SURFCONV_INLINE void with_mix(const Plan& plan, const Body& body) {
+  if constexpr (kLanes<T> >= kQuad) {
+    if (plan.mix == kQuad) return body(std::integral_constant<int, static_cast<int>(kQuad)>{});
+  }
+  body(std::integral_constant<int, 1>{});
 }

@@ -10,11 +10,11 @@ class Forward {
         plan_(conv),
         blocks_(channel_blocks(plan_, kBlock)),
         taps_(taps_at_once(conv, std::min(kBlock, to_quads(plan_.channels)))),
-        width_(plan_.depthwise ? plan_.multiplier * plan_.row : pad_width<T>(plan_.outputs)),
+        width_(plan_.lanewise ? plan_.multiplier * plan_.row : pad_width<T>(plan_.outputs)),
         ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
         input_(conv, plan_, tensors.input),
         guide_(conv, tensors.guide),
-        writes_rows_(!plan_.depthwise && plan_.outputs == width_ &&
+        writes_rows_(!plan_.lanewise && plan_.outputs == width_ &&
                      tensors.output.dtype == kComputeDType<T> && tensors.output.c == 1 &&
                      tensors.output.y == tensors.output.x * conv.x.out),
         prefetches_(plan_.row * static_cast<int64_t>(sizeof(T)) <= 64 && conv.y.kernel > 1),
@@ -69,23 +69,29 @@ class Forward {
   }
 
   void pack_weights() {
-    const int64_t depth = plan_.taps * plan_.row;
-    weights_.reset(
-        new T[static_cast<size_t>(depth * (plan_.depthwise ? plan_.multiplier : width_))]);
     initial_.assign(static_cast<size_t>(plan_.groups * width_), T(0));
-    const int64_t stride = plan_.depthwise ? plan_.row : width_;
     if (tensors_.bias.data != nullptr) {
       visit_storage<T>(tensors_.bias, [&](auto* bias) {
-        for (int64_t o = 0; o < conv_.out_channels; ++o) {
-          const int64_t place = plan_.depthwise
-                                    ? o % plan_.multiplier * stride + o / plan_.multiplier
-                                    : o / plan_.outputs * stride + o % plan_.outputs;
+        const auto set = [&](int64_t o, int64_t place) {
           initial_[static_cast<size_t>(place)] = widen(bias[o * tensors_.bias.c]);
+        };
+        if (plan_.lanewise) {
+          for_lane_weights<false>(conv_, plan_, [&](int64_t o, int64_t, int64_t k, int64_t lane) {
+            set(o, (plan_.mix == 1 ? k * plan_.row : 0) + lane);
+          });
+        } else {
+          for (int64_t o = 0; o < conv_.out_channels; ++o) {
+            set(o, o / plan_.outputs * width_ + o % plan_.outputs);
+          }
         }
       });
     }
-    if (plan_.depthwise)
-      return pack_depthwise(tensors_.weight, conv_.x.kernel, plan_, weights_.get());
+    if (plan_.lanewise) {
+      weights_ = pack_lanewise<T, false>(conv_, plan_, tensors_.weight);
+      return;
+    }
+    const int64_t depth = plan_.taps * plan_.row;
+    weights_.reset(new T[static_cast<size_t>(depth * width_)]);
     const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
     const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
     run_tasks(executor_, tasks, workers_for(executor_, tasks, depth * width_),
@@ -112,7 +118,7 @@ class Forward {
                           begin * tensors_.output.x
                     : scratch.out;
     const int64_t group_step = direct ? plan_.outputs : width_;
-    if (plan_.depthwise) {
+    if (plan_.lanewise) {
       for (int m = 0; m < count; ++m) {
         std::memcpy(scratch.out + m * ld_out, initial_.data(), static_cast<size_t>(ld_out * bytes));
       }
@@ -128,11 +134,12 @@ class Forward {
                     scratch.rows, ld_rows_);
         if (prefetches_ && first_tap + taps == plan_.taps)
           prefetch_ahead(scratch.tile, base, count);
-        if (plan_.depthwise) {
-          const DepthwiseBlock part{plan_.multiplier, block.padded, taps, plan_.row,
-                                    first_tap * plan_.multiplier * plan_.row + block.first};
-          depthwise_multiply<T>(part, count, scratch.rows, ld_rows_, weights_.get(),
-                                scratch.out + block.first, ld_out, plan_.row);
+        if (plan_.lanewise) {
+          with_mix<T>(plan_, [&](auto mix) {
+            lane_multiply<decltype(mix)::value>(lane_block(plan_, block, first_tap, taps), count,
+                                                scratch.rows, ld_rows_, weights_.get(),
+                                                scratch.out + block.first, ld_out, plan_.row);
+          });
         } else {
           const bool first = first_tap == 0 && block.first == 0;
           gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded, scratch.rows,
@@ -142,14 +149,10 @@ class Forward {
       }
     }
     if (direct) return;
-    if (plan_.depthwise) {
-      View output = tensors_.output;
-      output.c *= plan_.multiplier;
+    if (plan_.lanewise) {
       for (int64_t j = 0; j < plan_.multiplier; ++j) {
-        View plane = output;
-        advance(plane, j * tensors_.output.c);
-        store_pixels<T>(plane, n, 0, plan_.channels, conv_.x.out, begin, count,
-                        scratch.out + j * plan_.row, ld_out);
+        store_lanes<T>(multiplied(tensors_.output, plan_, j), plan_.out, n, conv_.x.out, begin,
+                       count, scratch.out + j * plan_.row, ld_out);
       }
     } else {
       for (int64_t g = 0; g < plan_.groups; ++g) {

@@ -58,11 +58,8 @@ class GradientRows {
                 const int64_t n = pass.first_image + i / done.count();
                 const int64_t y = done.begin + i % done.count();
                 const T* from = pass.in.has(y) ? row(pass, n, y) : zeros.data();
-                for (int64_t g = 0; g < plan_.groups; ++g) {
-                  store_pixels<T>(gradient_, n, g * plan_.channels, plan_.channels, conv_.x.in,
-                                  y * conv_.x.in, conv_.x.in, from + g * to_quads(plan_.channels),
-                                  plan_.row);
-                }
+                store_lanes<T>(gradient_, plan_.in, n, conv_.x.in, y * conv_.x.in, conv_.x.in, from,
+                               plan_.row);
               });
   }
 

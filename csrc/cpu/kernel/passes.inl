@@ -120,13 +120,9 @@ class InputRows {
               [&](int, int64_t task) {
                 const int64_t n = task / strips, begin = task % strips * strip;
                 const int64_t count = std::min(strip, pixels - begin);
-                const int64_t padded = to_quads(plan_.channels);
-                for (int64_t g = 0; g < plan_.groups; ++g) {
-                  load_pixels<T>(input_, pass.first_image + n, g * plan_.channels, plan_.channels,
-                                 conv_.x.in, first + begin, count,
-                                 memory_.get() + (n * pixels + begin) * plan_.row + g * padded,
-                                 plan_.row, padded);
-                }
+                load_lanes<T>(input_, plan_.in, pass.first_image + n, 0, plan_.row, conv_.x.in,
+                              first + begin, count,
+                              memory_.get() + (n * pixels + begin) * plan_.row, plan_.row);
               });
   }
 
