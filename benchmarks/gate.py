@@ -251,7 +251,7 @@ def gate(plan: Plan) -> list[tuple[str, Callable[[], list[Check]]]]:
         jobs.append((layer.name, lambda: function(layer, *arguments)))
 
     for layer in (shape.shrunk(plan.shrink) for shape in (*main, *others)):
-        important = layer.name in cases.MAIN
+        important = layer.name == "A" or (layer.name in cases.MAIN and not plan.quick)
         add(layer, at_scale_one)
         add(layer, same_bits, scene_of(layer, make_scene, smooth), threads)
         for subject, kind in combinations if important else combinations[: 1 if plan.quick else 2]:

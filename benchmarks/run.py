@@ -22,8 +22,8 @@ from typing import Any, Protocol
 
 import charts
 import compare
+import document
 import machine
-import markdown
 import peers
 from gate import Check, gate
 from plan import Limits, Plan, make_plan
@@ -56,7 +56,7 @@ class _NoBar:
 @contextmanager
 def _bar(total: int) -> Iterator[Bar]:
     try:
-        from tqdm import tqdm
+        from tqdm import tqdm  # type: ignore[import-untyped]
     except ImportError:
         print("Measuring (tqdm would show a progress bar) ...", file=sys.stderr)
         yield _NoBar()
@@ -87,7 +87,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     cores = os.cpu_count() or 1
     add("--threads", type=_count, nargs="+", metavar="N",
         default=list(range(1, min(cores, DEFAULT_THREADS) + 1)),
-        help="thread counts, the first one being what single runs use (default: %(default)s)")  # fmt: skip
+        help="thread counts; single runs use the first (default: %(default)s)")  # fmt: skip
     add("--suites", nargs="+", choices=list(SUITES), default=list(SUITES), metavar="NAME",
         help=f"what to measure: {', '.join(SUITES)} (default: all)")  # fmt: skip
     add("--compare", type=Path, metavar="FILE", help="an earlier results.json; writes compare.md")
@@ -157,7 +157,7 @@ def write(folder: Path, report: Report, draw: bool) -> list[Path]:
         else:
             drawn = charts.draw(folder, report.rows, report.machine)
     text = folder / "results.md"
-    text.write_text(markdown.render(report, drawn))
+    text.write_text(document.render(report, drawn))
     return [*paths, text, *(folder / name for names in drawn.values() for name in names)]
 
 

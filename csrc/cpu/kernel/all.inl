@@ -10,6 +10,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "lanewise.inl"
 #include "blocks.inl"
 #include "passes.inl"
+#include "walk.inl"
 #include "gather.inl"
 #include "scatter.inl"
 #include "scatter_interior.inl"

@@ -1,14 +1,31 @@
-// to[c] = sum over corners of weight * x
-template <class T, int CORNERS, class Channels>
-SURFCONV_INLINE void blend(const T* const* __restrict from, const T* weight, Channels channels,
-                           T* __restrict to) {
+// sink(c, sum over corners of weight * x), vector by vector
+template <int CORNERS, class T, class Channels, class Sink>
+SURFCONV_INLINE void blend(const T* const* from, const T* weight, Channels channels,
+                           const Sink& sink) {
   for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
     using V = Vec<T, decltype(width)::lanes>;
     V sum = load<V>(from[0] + c) * weight[0];
 #pragma GCC unroll 3
     for (int q = 1; q < CORNERS; ++q) sum += load<V>(from[q] + c) * weight[q];
-    store(to + c, sum);
+    sink(c, sum);
   });
+}
+
+// One tap of an interior pixel. One vector of channels: along the rows first, so that the weights
+// of the two axes are enough; more: each corner's weight is worth a product of its own.
+template <int ROWS, int COLUMNS, class T, class Channels, class Sink>
+SURFCONV_INLINE void sample_tap(const char* base, const TapSide<T>& y, const TapSide<T>& x,
+                                Channels channels, const Sink& sink) {
+  const auto corners = corners_of<ROWS, COLUMNS>(base, y, x);
+  if constexpr (ROWS == 2 && COLUMNS == 2 && is_one_vector<T>(Channels{})) {
+    using V = Vec<T, static_cast<int>(Channels::value)>;
+    const T* const* from = corners.from;
+    const V upper = load<V>(from[0]) * x.weight[0] + load<V>(from[1]) * x.weight[1];
+    const V lower = load<V>(from[2]) * x.weight[0] + load<V>(from[3]) * x.weight[1];
+    sink(int64_t{0}, V(upper * y.weight[0] + lower * y.weight[1]));
+  } else {
+    blend<ROWS * COLUMNS>(corners.from, corners.weight, channels, sink);
+  }
 }
 
 // Pixels begin .. end-1 of the tile, m of them at to + m * ld.
@@ -25,7 +42,9 @@ void gather_corners(const TapCorners<T>& tap, const char* base, int begin, int e
       from[q] = reinterpret_cast<const T*>(base + read[q * kTile + m]);
       weight[q] = weights[q * kTile + m];
     }
-    blend<T, CORNERS>(from, weight, channels, to + m * ld);
+    T* row = to + m * ld;
+    blend<CORNERS>(from, weight, channels,
+                   [&](int64_t c, auto sum) SURFCONV_INLINED { store(row + c, sum); });
   }
 }
 
@@ -44,83 +63,21 @@ void gather_tap(const TapCorners<T>& tap, const char* base, int begin, int end, 
   });
 }
 
-// The corners of one tap in two rows and two columns. One vector of channels: along the rows first,
-// so that four weights are enough; more: each corner's weight is worth a product of its own.
-template <class T, class Channels>
-SURFCONV_INLINE void blend_square(const T* const* __restrict from, T above, T below, T left,
-                                  T right, Channels channels, T* __restrict to) {
-  if constexpr (is_one_vector<T>(Channels{})) {
-    using V = Vec<T, static_cast<int>(Channels::value)>;
-    const V upper = load<V>(from[0]) * left + load<V>(from[1]) * right;
-    const V lower = load<V>(from[2]) * left + load<V>(from[3]) * right;
-    store(to, V(upper * above + lower * below));
-  } else {
-    const T weight[] = {above * left, above * right, below * left, below * right};
-    blend<T, 4>(from, weight, channels, to);
-  }
-}
-
-// One row of taps of an interior pixel. upper, lower: its two rows of the image, above and below
-// their weights; read, weights: the pixel's entries of the first tap's columns.
-template <class T, bool TWO_ROWS, int KX, class Channels>
-SURFCONV_INLINE void gather_tap_row(const char* upper, const char* lower, T above, T below,
-                                    const int64_t* read, const T* weights, int64_t kernel_x,
-                                    int64_t fixed, Channels channels, int64_t step, T* to) {
-  const auto at = [](const char* row, int64_t offset)
-                      SURFCONV_INLINED { return reinterpret_cast<const T*>(row + offset); };
-#pragma GCC unroll 3
-  for (int64_t tx = 0; tx < (KX > 0 ? KX : kernel_x); ++tx) {
-    if (tx == fixed) {
-      const T* from[2] = {at(upper, *read)};
-      const T weight[] = {above, below};
-      if constexpr (TWO_ROWS) from[1] = at(lower, *read);
-      blend<T, TWO_ROWS ? 2 : 1>(from, weight, channels, to);
-    } else {
-      const T left = weights[0], right = weights[kTile];
-      const T* from[4] = {at(upper, read[0]), at(upper, read[kTile])};
-      if constexpr (TWO_ROWS) {
-        from[2] = at(lower, read[0]);
-        from[3] = at(lower, read[kTile]);
-        blend_square<T>(from, above, below, left, right, channels, to);
-      } else {
-        const T weight[] = {left, right};
-        blend<T, 2>(from, weight, channels, to);
-      }
-    }
-    read += 2 * kTile;
-    weights += 2 * kTile;
-    to += step;
-  }
-}
-
 // Whole rows of taps of the interior pixels begin .. end-1, one tap after the other at to + m * ld.
-// The tables' pointers are copied: as members they would be read again after every store.
-template <class T, int KX, class Channels>
-void gather_interior(const Conv& conv, const AxisTable<T>& rows, const AxisTable<T>& columns,
-                     Rows taps_y, const char* base, int begin, int end, Channels channels, T* to,
-                     int64_t ld) {
-  const int64_t step = count_of(channels);
-  const int64_t kernel_x = KX > 0 ? KX : conv.x.kernel, fixed_y = conv.y.fixed_tap();
-  const int64_t fixed_x = KX > 0 ? KX / 2 : conv.x.fixed_tap();
-  const int64_t *read_y = rows.read + taps_y.begin * 2 * kTile, *read_x = columns.read;
-  const T *weight_y = rows.weight + taps_y.begin * 2 * kTile, *weight_x = columns.weight;
+template <int KX, class T, class Channels>
+void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+                     const char* base, int begin, int end, Channels channels, T* to, int64_t ld) {
+  const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
     T* out = to + m * ld;
-    const int64_t* read = read_y + m;
-    const T* weight = weight_y + m;
-    for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty) {
-      if (ty == fixed_y) {
-        gather_tap_row<T, false, KX>(base + *read, nullptr, T(1), T(0), read_x + m, weight_x + m,
-                                     kernel_x, fixed_x, channels, step, out);
-      } else {
-        gather_tap_row<T, true, KX>(base + read[0], base + read[kTile], weight[0], weight[kTile],
-                                    read_x + m, weight_x + m, kernel_x, fixed_x, channels, step,
-                                    out);
-      }
-      out += kernel_x * step;
-      read += 2 * kTile;
-      weight += 2 * kTile;
-    }
+    walk_taps<KX>(axis_y, axis_x, rows, columns, taps_y, m,
+                  [&](auto r, auto c, const TapSide<T>& y, const TapSide<T>& x, int64_t t)
+                      SURFCONV_INLINED {
+                        T* place = out + t * count_of(channels);
+                        sample_tap<decltype(r)::value, decltype(c)::value>(
+                            base, y, x, channels,
+                            [&](int64_t at, auto sum) SURFCONV_INLINED { store(place + at, sum); });
+                      });
   }
 }
 
@@ -137,12 +94,10 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
       return;
     }
     with_channels<T>(channels, [&](auto known) {
-      const auto gather = [&](auto kernel_x) {
-        gather_interior<T, decltype(kernel_x)::value>(conv, tile.rows(), tile.columns(), taps_y,
-                                                      base, run.begin, run.end, known, to, ld);
-      };
-      conv.x.kernel == 3 ? gather(std::integral_constant<int, 3>{})
-                         : gather(std::integral_constant<int, 0>{});
+      with_width(conv.x.kernel, [&](auto width) {
+        gather_interior<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y, base,
+                                                run.begin, run.end, known, to, ld);
+      });
     });
   });
 }

@@ -1,13 +1,5 @@
 // Scattering the taps of interior pixels, straight from the tables of the two axes.
 
-// A tap along one axis: its two places, or the first alone where the tap is fixed.
-template <class T>
-struct TapSide {
-  int64_t offset[2];  // bytes; of columns, which lie alike in the input and in its gradient
-  T weight[2];
-  T tap;  // tap(t) of the relation
-};
-
 // One tap in two rows and two columns, one vector of channels: along the rows first, so that the
 // weights of the two axes are enough.
 template <bool Writes, Slopes S, class T, class Channels, class Dot>
@@ -40,93 +32,44 @@ SURFCONV_INLINE void scatter_square(const T* const* from, T* const* to, const Ta
 }
 
 template <int ROWS, int COLUMNS, bool Writes, Slopes S, class T, class Channels, class Dot>
-SURFCONV_INLINE void scatter_place(const char* const* read, char* const* write, const TapSide<T>& y,
+SURFCONV_INLINE void scatter_place(const ScatterTarget<T>& target, const TapSide<T>& y,
                                    const TapSide<T>& x, Channels channels, T* row, Dot& dot) {
   constexpr int CORNERS = ROWS * COLUMNS;
-  const T* from[CORNERS];
-  T* to[CORNERS];
+  const auto corners = corners_of<ROWS, COLUMNS>(target.read, y, x);
+  T* to[CORNERS] = {};
+  T slope[CORNERS], slope_x[CORNERS];
 #pragma GCC unroll 4
   for (int q = 0; q < CORNERS; ++q) {
     const int i = q / COLUMNS, j = q % COLUMNS;
-    from[q] = reinterpret_cast<const T*>(read[i] + x.offset[j]);
-    if constexpr (Writes) to[q] = reinterpret_cast<T*>(write[i] + x.offset[j]);
+    if constexpr (Writes) to[q] = reinterpret_cast<T*>(target.write + y.write[i] + x.read[j]);
+    const T along_y = ROWS == 1 ? T(0) : (i == 0 ? -y.tap : y.tap) * x.weight[j];
+    const T along_x = COLUMNS == 1 ? T(0) : (j == 0 ? -x.tap : x.tap) * y.weight[i];
+    slope[q] = S == Slopes::one ? along_y + along_x : along_y;
+    slope_x[q] = along_x;
   }
   if constexpr (CORNERS == 4 && is_one_vector<T>(Channels{})) {
-    scatter_square<Writes, S>(from, to, y, x, channels, row, dot);
+    scatter_square<Writes, S>(corners.from, to, y, x, channels, row, dot);
   } else {
-    T weight[CORNERS], slope[CORNERS], slope_x[CORNERS];
-#pragma GCC unroll 4
-    for (int q = 0; q < CORNERS; ++q) {
-      const int i = q / COLUMNS, j = q % COLUMNS;
-      const T weight_y = ROWS == 1 ? T(1) : y.weight[i];
-      const T weight_x = COLUMNS == 1 ? T(1) : x.weight[j];
-      const T along_y = ROWS == 1 ? T(0) : (i == 0 ? -y.tap : y.tap) * weight_x;
-      const T along_x = COLUMNS == 1 ? T(0) : (j == 0 ? -x.tap : x.tap) * weight_y;
-      weight[q] = weight_y * weight_x;
-      slope[q] = S == Slopes::one ? along_y + along_x : along_y;
-      slope_x[q] = along_x;
-    }
-    scatter_corners<CORNERS, Writes, S, false>(from, to, weight, slope, slope_x, channels, row,
-                                               dot);
-  }
-}
-
-template <bool Writes, Slopes S, int ROWS, int KX, class T, class Channels, class Dot>
-SURFCONV_INLINE void scatter_tap_row(const char* const* read, char* const* write,
-                                     const TapSide<T>& y, const Axis& axis_x, const int64_t* read_x,
-                                     const T* weight_x, Channels channels, T* row, Dot& dot) {
-  const int64_t kernel_x = KX > 0 ? KX : axis_x.kernel;
-  const int64_t fixed_x = KX > 0 ? KX / 2 : axis_x.fixed_tap();
-#pragma GCC unroll 3
-  for (int64_t tx = 0; tx < kernel_x; ++tx) {
-    if (tx == fixed_x) {
-      const TapSide<T> x{{*read_x, 0}, {T(1), T(0)}, T(0)};
-      scatter_place<ROWS, 1, Writes, S>(read, write, y, x, channels, row, dot);
-    } else {
-      const TapSide<T> x{{read_x[0], read_x[kTile]},
-                         {weight_x[0], weight_x[kTile]},
-                         static_cast<T>(axis_x.tap_doubled(tx)) / 2};
-      scatter_place<ROWS, 2, Writes, S>(read, write, y, x, channels, row, dot);
-    }
-    read_x += 2 * kTile;
-    weight_x += 2 * kTile;
-    row += count_of(channels);
+    scatter_corners<CORNERS, Writes, S, false>(corners.from, to, corners.weight, slope, slope_x,
+                                               channels, row, dot);
   }
 }
 
 // Whole rows of taps of the interior pixels begin .. end-1.
 template <bool Writes, Slopes S, int KX, class T, class Channels>
-void scatter_interior(const Conv& conv, const AxisTable<T>& rows, const AxisTable<T>& columns,
-                      Rows taps_y, const ScatterTarget<T>& target, int begin, int end,
-                      Channels channels, T* matrix, int64_t ld) {
+void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+                      ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
+                      int64_t ld) {
   const Axis axis_y = conv.y, axis_x = conv.x;
-  const int64_t first = taps_y.begin * 2 * kTile;
-  const int64_t *read_y = rows.read + first, *write_y = rows.write + first, *read_x = columns.read;
-  const T *weight_y = rows.weight + first, *weight_x = columns.weight;
-  const ScatterTarget<T> to = target;
   for (int m = begin; m < end; ++m) {
-    PixelDot<T, Channels> dot(to, m);
+    PixelDot<T, Channels> dot(target, m);
     T* row = matrix + m * ld;
-    int64_t at = m;
-    for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty) {
-      const char* read[2] = {to.read + read_y[at], to.read + read_y[at + kTile]};
-      char* write[2] = {};
-      if constexpr (Writes) {
-        write[0] = to.write + write_y[at];
-        write[1] = to.write + write_y[at + kTile];
-      }
-      const TapSide<T> y{
-          {}, {weight_y[at], weight_y[at + kTile]}, static_cast<T>(axis_y.tap_doubled(ty)) / 2};
-      if (axis_y.fixed(ty)) {
-        scatter_tap_row<Writes, S, 1, KX>(read, write, y, axis_x, read_x + m, weight_x + m,
-                                          channels, row, dot);
-      } else {
-        scatter_tap_row<Writes, S, 2, KX>(read, write, y, axis_x, read_x + m, weight_x + m,
-                                          channels, row, dot);
-      }
-      row += axis_x.kernel * count_of(channels);
-      at += 2 * kTile;
-    }
+    walk_taps<KX>(axis_y, axis_x, rows, columns, taps_y, m,
+                  [&](auto r, auto c, const TapSide<T>& y, const TapSide<T>& x, int64_t t)
+                      SURFCONV_INLINED {
+                        scatter_place<decltype(r)::value, decltype(c)::value, Writes, S>(
+                            target, y, x, channels, row + t * count_of(channels), dot);
+                      });
     if constexpr (S != Slopes::none) dot.finish();
     if constexpr (S == Slopes::two) dot.finish_x();
   }
@@ -146,13 +89,11 @@ void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int6
       return;
     }
     with_channels<T>(channels, [&](auto known) {
-      const auto scatter = [&](auto kernel_x) {
-        scatter_interior<Writes, S, decltype(kernel_x)::value>(conv, tile.rows(), tile.columns(),
-                                                               taps_y, target, run.begin, run.end,
-                                                               known, matrix, ld);
-      };
-      conv.x.kernel == 3 ? scatter(std::integral_constant<int, 3>{})
-                         : scatter(std::integral_constant<int, 0>{});
+      with_width(conv.x.kernel, [&](auto width) {
+        scatter_interior<Writes, S, decltype(width)::value>(conv, tile.rows(), tile.columns(),
+                                                            taps_y, target, run.begin, run.end,
+                                                            known, matrix, ld);
+      });
     });
   });
 }

@@ -1,0 +1,80 @@
+"""How long the run takes: seconds for every suite, counted so that their sum is the run's length.
+
+A suite shares its seconds among its jobs by the work in them (multiplications times calls), and a
+job times its calls round after round until its share is used. So the sum below bounds the run,
+except where `minimum` rounds of a slow peer do not fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+#: Adds up to about 5 minutes. The gate's is what it was seen to take: checks are never cut short.
+FULL_SECONDS = {
+    "gate": 35.0,
+    "layers": 106.0,
+    "channels": 20.0,
+    "grouped": 12.0,
+    "dtypes": 14.0,
+    "levels": 14.0,
+    "peers": 28.0,
+    "conv3d": 20.0,
+    "scaling": 26.0,
+    "memory": 14.0,
+    "net": 14.0,
+}
+#: Adds up to less than a minute.
+QUICK_SECONDS = {
+    "gate": 8.0,
+    "layers": 8.0,
+    "channels": 3.0,
+    "grouped": 2.0,
+    "dtypes": 3.0,
+    "levels": 2.5,
+    "peers": 5.0,
+    "conv3d": 1.5,
+    "scaling": 4.0,
+    "memory": 3.0,
+    "net": 4.0,
+}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How long one job measures: rounds within the seconds, but never fewer than `minimum`."""
+
+    seconds: float
+    minimum: int
+    maximum: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Budgets and breadth of a run.
+
+    Attributes:
+        quick: few rounds, fewer shapes and depths.
+        threads: thread counts to measure with, the first one being what single runs use.
+        seconds: budget of every suite, by name.
+        minimum: rounds that everybody takes part in.
+        maximum: rounds after which a fast job ends before its seconds do.
+        shrink: divisor of all frame sizes; above 1 only where numbers do not matter (tests).
+    """
+
+    quick: bool
+    threads: tuple[int, ...]
+    seconds: dict[str, float] = field(repr=False)
+    minimum: int
+    maximum: int
+    shrink: int = 1
+
+    @property
+    def total(self) -> float:
+        return sum(self.seconds.values())
+
+
+def make_plan(quick: bool, threads: tuple[int, ...], suites: tuple[str, ...]) -> Plan:
+    """The plan of a full or a quick run over some of the suites."""
+    table = QUICK_SECONDS if quick else FULL_SECONDS
+    seconds = {name: table[name] for name in ("gate", *suites)}
+    return Plan(quick, threads, seconds, minimum=2 if quick else 4, maximum=60)

@@ -1,0 +1,81 @@
+// The taps of one interior pixel, straight from the tables of the two axes.
+
+// A tap along one axis: its two places, or the first alone where the tap is fixed. Bytes.
+template <class T>
+struct TapSide {
+  int64_t read[2];
+  int64_t write[2];  // of rows; columns lie in the gradient as in the input
+  T weight[2];
+  T tap;  // tap(t) of the relation
+};
+
+template <bool TWO, class T>
+SURFCONV_INLINE TapSide<T> tap_side(const int64_t* read, const int64_t* write, const T* weight,
+                                    T tap) {
+  if constexpr (TWO) {
+    return {{read[0], read[kTile]}, {write[0], write[kTile]}, {weight[0], weight[kTile]}, tap};
+  }
+  return {{read[0], 0}, {write[0], 0}, {T(1), T(0)}, T(0)};
+}
+
+// body(rows, columns, y, x, t) for each tap in the rows taps_y of the kernel: constants that say
+// how many rows and columns of corners the tap has, its sides and its number from the first. KX:
+// the kernel's odd width where it is known, else 0.
+template <int KX, class T, class Body>
+SURFCONV_INLINE void walk_taps(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
+                               const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
+  using One = std::integral_constant<int, 1>;
+  using Two = std::integral_constant<int, 2>;
+  const int64_t kernel_x = KX > 0 ? KX : axis_x.kernel;
+  const int64_t fixed_x = KX > 0 ? KX / 2 : axis_x.fixed_tap();
+  const int64_t* columns_read = columns.read + m;
+  const T* columns_weight = columns.weight + m;
+  int64_t at_y = taps_y.begin * 2 * kTile + m, t = 0;
+  for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty, at_y += 2 * kTile) {
+    const auto walk_row = [&](auto rows_of_tap) SURFCONV_INLINED {
+      constexpr bool two_rows = decltype(rows_of_tap)::value == 2;
+      const T tap_y = static_cast<T>(axis_y.tap_doubled(ty)) / 2;
+      const TapSide<T> y =
+          tap_side<two_rows, T>(rows.read + at_y, rows.write + at_y, rows.weight + at_y, tap_y);
+      int64_t at_x = 0;
+#pragma GCC unroll 3
+      for (int64_t tx = 0; tx < kernel_x; ++tx, ++t, at_x += 2 * kTile) {
+        const int64_t* read = columns_read + at_x;
+        const T* weight = columns_weight + at_x;
+        if (tx == fixed_x) {
+          body(rows_of_tap, One{}, y, tap_side<false, T>(read, read, weight, T(0)), t);
+        } else {
+          const T tap_x = static_cast<T>(axis_x.tap_doubled(tx)) / 2;
+          body(rows_of_tap, Two{}, y, tap_side<true, T>(read, read, weight, tap_x), t);
+        }
+      }
+    };
+    axis_y.fixed(ty) ? walk_row(One{}) : walk_row(Two{});
+  }
+}
+
+// The corners of a tap, row by row: where they are and what they weigh.
+template <int ROWS, int COLUMNS, class T>
+struct Corners {
+  static constexpr int count = ROWS * COLUMNS;
+  const T* from[count];
+  T weight[count];
+};
+template <int ROWS, int COLUMNS, class T>
+SURFCONV_INLINE Corners<ROWS, COLUMNS, T> corners_of(const char* base, const TapSide<T>& y,
+                                                     const TapSide<T>& x) {
+  Corners<ROWS, COLUMNS, T> corners;
+#pragma GCC unroll 4
+  for (int q = 0; q < ROWS * COLUMNS; ++q) {
+    const int i = q / COLUMNS, j = q % COLUMNS;
+    corners.from[q] = reinterpret_cast<const T*>(base + y.read[i] + x.read[j]);
+    corners.weight[q] = y.weight[i] * x.weight[j];
+  }
+  return corners;
+}
+
+// body(kernel's width as a constant) where it is one that nets have, else 0.
+template <class Body>
+SURFCONV_INLINE void with_width(int64_t kernel_x, const Body& body) {
+  kernel_x == 3 ? body(std::integral_constant<int, 3>{}) : body(std::integral_constant<int, 0>{});
+}

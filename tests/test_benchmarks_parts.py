@@ -1,0 +1,141 @@
+"""What the benchmark programs compute: the net, the peers, the gate's own relation, the depth."""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torch import nn
+from torch.nn.functional import conv2d
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import candidates
+import cases
+import frames
+import gate
+import net
+import peers
+import points
+from pyramid import Pyramid
+from surfconv_ops import DepthLevels, SurfConv2d
+from voxels import voxelise
+
+
+def test_the_net_is_the_papers() -> None:
+    plain = net.PaperNet()
+    assert sum(parameter.numel() for parameter in plain.parameters()) == 65_008
+    surf = net.PaperNet(net.surf_factory(reference_depth=4.0))
+    assert list(surf.state_dict()) == list(plain.state_dict())
+    surf.load_state_dict(plain.state_dict())
+    for module in surf.modules():
+        if isinstance(module, nn.Conv2d):
+            assert isinstance(module, SurfConv2d) == (module.kernel_size != (1, 1))
+    image = torch.randn(1, 6, 48, 64)
+    expected = plain.eval()(image)
+    assert expected.shape == (1, 12, 48, 64)
+    at_reference = surf.eval()(image, torch.full((1, 48, 64), 4.0))
+    torch.testing.assert_close(at_reference, expected, rtol=1e-4, atol=1e-5)
+    elsewhere = surf(image, torch.full((1, 48, 64), 2.0))
+    assert (elsewhere - expected).abs().max() > 1e-3
+
+
+def test_depth_reaches_every_size_once() -> None:
+    depth = torch.arange(35.0).reshape(1, 5, 7)
+    by_size = net.DepthBySize(depth)
+    assert by_size.at(5, 7) is depth
+    assert by_size.at(2, 3).tolist() == [[[0.0, 2.0, 4.0], [14.0, 16.0, 18.0]]]
+    assert by_size.at(2, 3) is by_size.at(2, 3)
+
+
+@pytest.mark.parametrize("peer", [peers.GridSampleConv2d, peers.ReferenceConv2d])
+@pytest.mark.parametrize("layer", ["A", "stem"])
+def test_peers_compute_what_surf_conv2d_computes(peer: type[peers.DepthConv2d], layer: str) -> None:
+    shape = {**cases.MAIN, **cases.NET_LAYERS}[layer].shrunk(10)
+    assert_peer_agrees(peer, shape)
+
+
+@pytest.mark.skipif(bool(peers.unavailable()), reason="torchvision cannot be used here")
+@pytest.mark.parametrize("layer", ["A", "stem"])
+def test_deform_conv2d_computes_what_surf_conv2d_computes(layer: str) -> None:
+    shape = {**cases.MAIN, **cases.NET_LAYERS}[layer].shrunk(10)
+    assert_peer_agrees(peers.DeformConv2d, shape)
+
+
+def assert_peer_agrees(peer: type[peers.DepthConv2d], shape: cases.Layer) -> None:
+    scene = candidates.scene_of(shape, frames.make_scene, frames.RANDOM)
+    ours = candidates.make_candidate(candidates.CONTINUOUS, shape, "contiguous", scene)
+    module = candidates.make_conv(shape, peer, reference_depth=scene.reference_depth)
+    theirs = candidates.Candidate(module, ours.input.clone(), scene.depth.clone())
+    assert gate.relative_rms(theirs.forward(), ours.forward()) < 1e-4
+    pairs = zip(theirs.backward()(), ours.backward()(), strict=True)
+    for name, (got, want) in zip(("input", "weight", "bias"), pairs, strict=False):
+        assert gate.relative_rms(got, want) < 1e-3, name
+
+
+@pytest.mark.parametrize(("center", "step"), [(4.0, 1), (2.0, 2), (8.0, 1)])
+def test_the_pyramid_is_levels_mode_where_both_grids_meet(center: float, step: int) -> None:
+    levels = DepthLevels([], [center])
+    conv = nn.Conv2d(3, 5, 3, padding=1)
+    surf = SurfConv2d.from_conv2d(conv, reference_depth=4.0, levels=levels)
+    image, depth = torch.randn(2, 3, 21, 25), torch.full((2, 21, 25), center)
+    depth[:, :, :3] = 0.0
+    both = [layer(image, depth)[..., 2:-2:step, 4:-2:step] for layer in (
+        Pyramid(conv, levels, 4.0), surf)]  # fmt: skip
+    torch.testing.assert_close(both[0], both[1], rtol=1e-4, atol=1e-5)
+    # Pixels without depth are a level of their own, the plain convolution.
+    missing = Pyramid(conv, levels, 4.0)(image, depth)[..., :3]
+    torch.testing.assert_close(missing, conv(image)[..., :3], rtol=1e-4, atol=1e-5)
+
+
+def test_the_gates_relation_is_conv2d_at_scale_one_and_nothing_else() -> None:
+    for shape in (cases.NET_LAYERS["stem"], cases.GROUPED["grouped"]):
+        layer = shape.shrunk(8)
+        conv = candidates.make_conv(layer).double()
+        image = candidates.make_input(layer, "contiguous").double()
+        scale = torch.ones(layer.batch, *layer.output_size, dtype=torch.float64)
+        chosen = points.choose_points(layer)
+        arguments = (layer, chosen, image, conv.weight, conv.bias)
+        n, y, x = chosen.unbind(1)
+        expected = conv2d(
+            image, conv.weight, conv.bias, layer.stride, layer.padding, groups=layer.groups
+        )[n, :, y, x]
+        exact = points.at_points(*arguments, scale, None, 0.0)
+        torch.testing.assert_close(exact, expected, rtol=1e-12, atol=1e-12)
+        wider = points.at_points(*arguments, 1.5 * scale, None, 0.0)
+        assert gate.relative_rms(wider, expected) > 0.1
+
+
+def test_depth_of_every_kind_is_usable(monkeypatch: pytest.MonkeyPatch) -> None:
+    for kind in (*frames.smooth_kinds(), frames.RANDOM):
+        scene = frames.make_scene(kind, 2, 24, 32)
+        valid = scene.depth > 0
+        assert scene.depth.shape == (2, 24, 32) and valid.float().mean() > 0.5
+        counts = torch.bincount(scene.levels.assign(scene.depth)[valid])
+        assert len(counts) == 4 and counts.min() > 0.15 * counts.sum()
+    scale = frames.REFERENCE_DEPTH / frames.make_scene(frames.RANDOM, 1, 64, 64).depth
+    assert math.isclose(float(scale.min()), 0.3, rel_tol=0.02)
+    assert math.isclose(float(scale.max()), 6.0, rel_tol=0.02)
+    monkeypatch.delenv(frames.VARIABLE, raising=False)
+    frames._real_frames.cache_clear()
+    try:
+        assert frames.smooth_kinds() == (frames.SYNTHETIC,)
+        assert "synthetic" in frames.source()
+        assert 0 < (frames.make_scene(frames.SYNTHETIC, 1, 60, 80).depth == 0).sum() < 240
+    finally:
+        frames._real_frames.cache_clear()
+
+
+def test_voxels_hold_the_mean_of_their_points() -> None:
+    features = torch.tensor([[[1.0, 3.0, 5.0]]])
+    depth = torch.tensor([[1.0, 1.0, 0.0]])
+    grid = voxelise(features, depth, 1.0, (2, 2, 4), 1.0)
+    # Columns lie at x = -1, 0 and 1: the first two fall into voxels 0 and 1; the last has no depth.
+    assert grid.shape == (1, 1, 2, 2, 4)
+    assert grid[0, 0, :, 1, 1].tolist() == [1.0, 3.0]
+    assert grid.sum() == 4.0
+    merged = voxelise(features, depth, 1.0, (1, 1, 1), 10.0)
+    assert merged.flatten().tolist() == [2.0]
