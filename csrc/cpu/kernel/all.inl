@@ -12,6 +12,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "passes.inl"
 #include "walk.inl"
 #include "gather.inl"
+#include "lane_forward.inl"
 #include "scatter.inl"
 #include "scatter_interior.inl"
 #include "forward.inl"

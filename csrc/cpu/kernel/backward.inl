@@ -76,13 +76,16 @@ class Backward {
     for (Slot& slot : slots) {
       const int64_t n = pass.first_image + slot.first_image;
       const T* image = grad_input_.row(pass, n, pass.in.begin);
-      slot.row_offset.assign(static_cast<size_t>(conv_.y.in), 0);
-      for (int64_t y = slot.reach.begin; y < slot.reach.end; ++y) {
-        const bool own = slot.own.has(y);
-        slot.row_offset[static_cast<size_t>(y)] =
-            byte_distance(image, own ? grad_input_.row(pass, n, y) : next);
-        if (!own) next += elements;
-      }
+      const int64_t step = elements * static_cast<int64_t>(sizeof(T));
+      const int64_t before = slot.own.begin - slot.reach.begin;
+      const int64_t spill = byte_distance(image, next);
+      slot.places = {slot.own.begin,
+                     slot.own.end,
+                     step,
+                     spill - slot.reach.begin * step,
+                     -pass.in.begin * step,
+                     spill + (before - slot.own.end) * step};
+      next += slot.spilled() * elements;
     }
   }
 
@@ -96,7 +99,7 @@ class Backward {
         const int64_t n = pass.first_image + slot.first_image;
         const T* image = grad_input_.row(pass, n, pass.in.begin);
         const T* from = reinterpret_cast<const T*>(reinterpret_cast<uintptr_t>(image) +
-                                                   slot.row_offset[static_cast<size_t>(y)]);
+                                                   static_cast<uintptr_t>(slot.places(y)));
         T* to = grad_input_.row(pass, n, y);
         for (int64_t e = 0; e < elements; ++e) to[e] += from[e];
       }
@@ -129,8 +132,7 @@ class Backward {
     }
     if (tensors_.grad_bias.data != nullptr) target.bias = partial + weight_elements_;
     const bool scatters = grad_input_.needed();
-    const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in,
-                            scatters ? slot.row_offset.data() : nullptr};
+    const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in, scatters ? &slot.places : nullptr};
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
     target.first_pixel = pass.out.begin * conv_.x.out;
     target.pixels = pass.out.count() * conv_.x.out;

@@ -54,6 +54,10 @@ class BackwardTile {
         ld_rows_(
             pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowPad)) +
             16),
+        in_place_((plan_.lanewise ? plan_.multiplier == 1 && plan_.row == conv.out_channels
+                                  : plan_.outputs == width_) &&
+                  tensors.grad_output.dtype == kComputeDType<T> && tensors.grad_output.c == 1 &&
+                  tensors.grad_output.y == tensors.grad_output.x * conv.x.out),
         needs_matrix_(tensors.grad_input.data != nullptr || tensors.grad_scale.data != nullptr),
         zeros_(static_cast<size_t>(std::max(plan_.row, ld_rows_) + 2 * kLanes<T>), T(0)) {}
 
@@ -131,8 +135,8 @@ class BackwardTile {
   void run(Scratch& scratch, const Unit& unit, const Target& target, const T* guide, int64_t n,
            int64_t begin, int count, const AxisSteps& steps_y, const AxisSteps& steps_x) const {
     scratch.tile.place(tensors_.scale, guide, n, begin, count, steps_y, steps_x);
-    load_gradients(scratch, unit, n, begin, count);
-    if (target.bias != nullptr) add_bias(scratch, unit, count, target.bias);
+    const Gradients gradients = load_gradients(scratch, unit, n, begin, count);
+    if (target.bias != nullptr) add_bias(gradients, unit, count, target.bias);
     std::fill(scratch.dot, scratch.dot + 2 * kTile * kLanes<T>, T(0));
     const int64_t unseen_read = byte_distance(target.input, zeros_.data());
     const int64_t unseen_write = byte_distance(target.grad_input, scratch.discard);
@@ -147,7 +151,8 @@ class BackwardTile {
         T* weight = target.weight;
         for (const ChannelBlock& block : unit.blocks) {
           const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
-          if (needs_matrix_) matrix_gradient(scratch, unit, block, first_tap, taps, count);
+          if (needs_matrix_)
+            matrix_gradient(scratch, gradients, unit, block, first_tap, taps, count);
           const char* read = target.input + channel * static_cast<int64_t>(sizeof(T));
           if constexpr (Writes || S != Slopes::none) {
             char* write = nullptr;
@@ -161,7 +166,7 @@ class BackwardTile {
                         ld_rows_);
           }
           if (weight != nullptr) {
-            weight_gradient(scratch, unit, block, first_tap, taps, count, weight);
+            weight_gradient(scratch, gradients, block, first_tap, taps, count, weight);
             weight += weight_elements(block);
           }
         }
@@ -207,71 +212,103 @@ class BackwardTile {
     target.grad_input != nullptr ? by_slopes(std::true_type{}) : by_slopes(std::false_type{});
   }
 
-  T* gradients(Scratch& scratch, const Unit& unit, const ChannelBlock& block) const {
-    return scratch.grad_out + (block.group - unit.blocks.front().group) * kTile * width_;
-  }
+  // The gradient of the output at a tile's pixels: a pixel every `ld`, of lanes
+  // [multiplier][kBlock].
+  struct Gradients {
+    const T* data;
+    int64_t ld, group_step, first_group;
 
-  void load_gradients(Scratch& scratch, const Unit& unit, int64_t n, int64_t begin,
-                      int count) const {
-    if (plan_.lanewise) {
-      // [pixel][multiplier][kBlock]: a unit of lanes is one block.
-      const ChannelBlock& block = unit.blocks.front();
+    const T* of(const ChannelBlock& block) const {
+      return data + (block.group - first_group) * group_step;
+    }
+  };
+
+  // In place where whole blocks of the products may read it there.
+  Gradients load_gradients(Scratch& scratch, const Unit& unit, int64_t n, int64_t begin,
+                           int count) const {
+    const View& from = tensors_.grad_output;
+    const ChannelBlock& block = unit.blocks.front();
+    if (in_place_ && count % kRowPad == 0) {
+      const T* pixel = static_cast<const T*>(from.data) + n * from.n + begin * from.x;
+      const int64_t first = plan_.lanewise ? block.first : block.group * plan_.outputs;
+      return {pixel + first, from.x, plan_.outputs, block.group};
+    }
+    if (plan_.lanewise) {  // a unit of lanes is one block
       for (int64_t j = 0; j < plan_.multiplier; ++j) {
-        load_lanes<T>(multiplied(tensors_.grad_output, plan_, j), plan_.out, n, block.first,
-                      block.padded, conv_.x.out, begin, count, scratch.grad_out + j * kBlock,
-                      width_);
+        load_lanes<T>(multiplied(from, plan_, j), plan_.out, n, block.first, block.padded,
+                      conv_.x.out, begin, count, scratch.grad_out + j * kBlock, width_);
       }
-      return;
+    } else {
+      for (int64_t g = block.group; g <= unit.blocks.back().group; ++g) {
+        load_pixels<T>(from, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin, count,
+                       scratch.grad_out + (g - block.group) * kTile * width_, width_, width_);
+      }
     }
-    for (int64_t g = unit.blocks.front().group; g <= unit.blocks.back().group; ++g) {
-      load_pixels<T>(tensors_.grad_output, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin,
-                     count, scratch.grad_out + (g - unit.blocks.front().group) * kTile * width_,
-                     width_, width_);
-    }
+    return {scratch.grad_out, width_, kTile * width_, block.group};
   }
 
-  void add_bias(Scratch& scratch, const Unit& unit, int count, T* bias) const {
+  // to[c] += sum over pixels
+  static void add_columns(const T* from, int64_t ld, int count, int64_t columns, T* to) {
+    for_channels<T>(to_quads(columns), [&](int64_t c, auto width) SURFCONV_INLINED {
+      constexpr int L = decltype(width)::lanes;
+      using V = Vec<T, L>;
+      V even{}, odd{};
+      int m = 0;
+      for (; m + 1 < count; m += 2) {
+        even += load<V>(from + m * ld + c);
+        odd += load<V>(from + (m + 1) * ld + c);
+      }
+      if (m < count) even += load<V>(from + m * ld + c);
+      T sums[L];
+      store(sums, V(even + odd));
+      for (int i = 0; i < std::min<int64_t>(L, columns - c); ++i) to[c + i] += sums[i];
+    });
+  }
+
+  void add_bias(const Gradients& gradients, const Unit& unit, int count, T* bias) const {
     for (const ChannelBlock& block : unit.blocks) {
-      const T* from = gradients(scratch, unit, block);
-      if (plan_.lanewise) {
+      const T* from = gradients.of(block);
+      if (!plan_.lanewise) {
+        if (block.first != 0) continue;
+        add_columns(from, gradients.ld, count, plan_.outputs, bias + block.group * plan_.outputs);
+        continue;
+      }
+      for (int64_t j = 0; j < plan_.multiplier; ++j) {
+        T sums[kBlock] = {};
+        add_columns(from + j * kBlock, gradients.ld, count, block.padded, sums);
         for_lane_weights<false>(conv_, plan_, [&](int64_t o, int64_t c, int64_t k, int64_t lane) {
           const int64_t at = lane - block.first;
-          if (c != 0 || at < 0 || at >= block.padded) return;
-          const T* lanes = from + at + (plan_.mix == 1 ? k * kBlock : 0);
-          T sum = 0;
-          for (int m = 0; m < count; ++m) sum += lanes[m * width_];
-          bias[o] += sum;
+          const bool wanted = plan_.mix == 1 ? k == j : c == 0;
+          if (wanted && at >= 0 && at < block.padded) bias[o] += sums[at];
         });
-      } else if (block.first == 0) {
-        T* to = bias + block.group * plan_.outputs;
-        for (int m = 0; m < count; ++m) {
-          for (int64_t o = 0; o < plan_.outputs; ++o) to[o] += from[m * width_ + o];
-        }
       }
     }
   }
 
-  void matrix_gradient(Scratch& scratch, const Unit& unit, const ChannelBlock& block,
-                       int64_t first_tap, int64_t taps, int count) const {
-    const T* from = gradients(scratch, unit, block);
+  void matrix_gradient(Scratch& scratch, const Gradients& gradients, const Unit& unit,
+                       const ChannelBlock& block, int64_t first_tap, int64_t taps,
+                       int count) const {
+    const T* from = gradients.of(block);
+    const int64_t ld = gradients.ld;
     if (!plan_.lanewise) {
       const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
       const int64_t index = (&block - unit.blocks.data()) + block_index(unit);
-      gemm_packed<T>(round_up(count, kRowPad), taps * block.padded, plan_.outputs, from, width_,
+      gemm_packed<T>(round_up(count, kRowPad), taps * block.padded, plan_.outputs, from, ld,
                      weights_.get() + (index * tap_blocks + first_tap / taps_) * stride_,
                      scratch.rows, ld_rows_, zeros_.data());
       return;
     }
     with_mix<T>(plan_, [&](auto mix) {
       lane_matrix_gradient<decltype(mix)::value>(lane_block(plan_, block, first_tap, taps), count,
-                                                 from, width_, kBlock, weights_.get(), scratch.rows,
+                                                 from, ld, kBlock, weights_.get(), scratch.rows,
                                                  ld_rows_);
     });
   }
 
-  void weight_gradient(Scratch& scratch, const Unit& unit, const ChannelBlock& block,
+  void weight_gradient(Scratch& scratch, const Gradients& gradients, const ChannelBlock& block,
                        int64_t first_tap, int64_t taps, int count, T* weight) const {
-    const T* from = gradients(scratch, unit, block);
+    const T* from = gradients.of(block);
+    const int64_t ld = gradients.ld;
     if (!plan_.lanewise) {
       // What pads the matrix would else add whatever lies there.
       const int64_t used = taps * block.padded;
@@ -281,17 +318,17 @@ class BackwardTile {
       }
       if (swapped_) {
         gemm_transposed<T, kSwappedRows>(round_up(plan_.outputs, kSwappedRows), used, count, from,
-                                         width_, scratch.rows, ld_rows_,
+                                         ld, scratch.rows, ld_rows_,
                                          weight + first_tap * block.padded, weight_row(block));
       } else {
-        gemm_transposed<T, kRowPad>(padded, plan_.outputs, count, scratch.rows, ld_rows_, from,
-                                    width_, weight + first_tap * block.padded * width_, width_);
+        gemm_transposed<T, kRowPad>(padded, plan_.outputs, count, scratch.rows, ld_rows_, from, ld,
+                                    weight + first_tap * block.padded * width_, width_);
       }
       return;
     }
     with_mix<T>(plan_, [&](auto mix) {
       lane_weight_gradient<decltype(mix)::value>(
-          lane_block(plan_, block, first_tap, taps), count, scratch.rows, ld_rows_, from, width_,
+          lane_block(plan_, block, first_tap, taps), count, scratch.rows, ld_rows_, from, ld,
           kBlock, weight + first_tap * plan_.weights_of_tap() * block.padded);
     });
   }
@@ -313,6 +350,7 @@ class BackwardTile {
   const int64_t taps_;
   const bool swapped_;  // partial grad_weight as [output][tap, channel]: few outputs, less padding
   const int64_t width_, ld_rows_;
+  const bool in_place_;  // the gradient of the output may be read where it lies
   const bool needs_matrix_;
   const std::vector<T> zeros_;
   std::unique_ptr<T[]> weights_;

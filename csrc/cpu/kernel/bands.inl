@@ -4,8 +4,8 @@
 struct Slot {
   int64_t first_image, images;  // within the pass
   Rows out;
-  Rows own, reach;                  // input rows; reach holds own
-  std::vector<int64_t> row_offset;  // bytes from the gradient's image to each row of reach
+  Rows own, reach;   // input rows; reach holds own
+  RowPlaces places;  // of the rows of reach in the gradient
 
   int64_t spilled() const { return reach.count() - own.count(); }
 };

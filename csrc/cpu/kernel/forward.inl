@@ -123,23 +123,25 @@ class Forward {
         std::memcpy(scratch.out + m * ld_out, initial_.data(), static_cast<size_t>(ld_out * bytes));
       }
     }
+    const bool fused = plan_.lanewise && plan_.mix == 1 && plan_.multiplier == 1;
+    if (fused) {
+      lane_forward(conv_, plan_, scratch.tile, base, weights_.get(), scratch.out, ld_out);
+    }
     for (int64_t first_tap = 0; first_tap < plan_.taps; first_tap += taps_) {
       const int64_t taps = std::min(taps_, plan_.taps - first_tap);
+      if (fused && scratch.tile.interior()) break;
       if (!scratch.tile.interior()) {
         scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
       }
       for (const ChannelBlock& block : blocks_) {
         const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
         gather_tile(conv_, scratch.tile, first_tap, taps, base + channel * bytes, block.padded,
-                    scratch.rows, ld_rows_);
-        if (prefetches_ && first_tap + taps == plan_.taps)
+                    scratch.rows, ld_rows_, !fused);
+        if (prefetches_ && first_tap + taps == plan_.taps) {
           prefetch_ahead(scratch.tile, base, count);
+        }
         if (plan_.lanewise) {
-          with_mix<T>(plan_, [&](auto mix) {
-            lane_multiply<decltype(mix)::value>(lane_block(plan_, block, first_tap, taps), count,
-                                                scratch.rows, ld_rows_, weights_.get(),
-                                                scratch.out + block.first, ld_out, plan_.row);
-          });
+          multiply_lanes(scratch, block, first_tap, taps, count, fused);
         } else {
           const bool first = first_tap == 0 && block.first == 0;
           gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded, scratch.rows,
@@ -160,6 +162,22 @@ class Forward {
                         count, scratch.out + g * width_, ld_out);
       }
     }
+  }
+
+  void multiply_lanes(Scratch& scratch, const ChannelBlock& block, int64_t first_tap, int64_t taps,
+                      int count, bool fused) const {
+    const LaneBlock part = lane_block(plan_, block, first_tap, taps);
+    with_mix<T>(plan_, [&](auto mix) {
+      const auto multiply = [&](int begin, int end) {
+        lane_multiply<decltype(mix)::value>(
+            part, end - begin, scratch.rows + begin * ld_rows_, ld_rows_, weights_.get(),
+            scratch.out + begin * width_ + block.first, width_, plan_.row);
+      };
+      if (!fused) return multiply(0, count);
+      scratch.tile.for_runs([&](const Run& run) {
+        if (!run.interior) multiply(run.begin, run.end);
+      });
+    });
   }
 
   // The rows that the lowest taps of the tiles to come will meet first, while the product is busy:

@@ -81,10 +81,11 @@ void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, 
   }
 }
 
-// The gathered matrix of a tile: `taps` from first_tap on, of `channels` each.
+// The gathered matrix of a tile: `taps` from first_tap on, of `channels` each; interior pixels only
+// if wanted.
 template <class T>
 void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64_t taps,
-                 const char* base, int64_t channels, T* to, int64_t ld) {
+                 const char* base, int64_t channels, T* to, int64_t ld, bool interior = true) {
   const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
   tile.for_runs([&](const Run& run) {
     if (!run.interior) {
@@ -93,6 +94,7 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
       }
       return;
     }
+    if (!interior) return;
     with_channels<T>(channels, [&](auto known) {
       with_width(conv.x.kernel, [&](auto width) {
         gather_interior<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y, base,

@@ -25,6 +25,20 @@ SURFCONV_INLINE Vec<T, N> spread(Vec<T, N> v) {
   }
 }
 
+// sum += what the lanes of x contribute; `step` from one k's weights to the next.
+template <int MIX, class T, class V>
+SURFCONV_INLINE void add_lanes(V& sum, V x, const T* weight, int64_t step) {
+  constexpr int L = static_cast<int>(sizeof(V) / sizeof(T));
+  if constexpr (MIX == 1) {
+    sum += x * load<V>(weight);
+  } else {
+    sum += spread<0, T, L>(x) * load<V>(weight);
+    sum += spread<1, T, L>(x) * load<V>(weight + step);
+    sum += spread<2, T, L>(x) * load<V>(weight + 2 * step);
+    sum += spread<3, T, L>(x) * load<V>(weight + 3 * step);
+  }
+}
+
 // body(first lane, Width, VECTORS): four vectors at a time, so that their sums overlap.
 template <class T, class Body>
 SURFCONV_INLINE void for_lane_chunks(int64_t lanes, const Body& body) {
@@ -59,16 +73,7 @@ void lane_multiply(const LaneBlock& block, int count, const T* rows, int64_t ld,
         for (int64_t t = 0; t < taps; ++t) {
 #pragma GCC unroll 4
           for (int i = 0; i < N; ++i) {
-            const V x = load<V>(row + i * L);
-            const T* at = weight + i * L;
-            if constexpr (MIX == 1) {
-              sum[i] += x * load<V>(at);
-            } else {
-              sum[i] += spread<0, T, L>(x) * load<V>(at);
-              sum[i] += spread<1, T, L>(x) * load<V>(at + step);
-              sum[i] += spread<2, T, L>(x) * load<V>(at + 2 * step);
-              sum[i] += spread<3, T, L>(x) * load<V>(at + 3 * step);
-            }
+            add_lanes<MIX>(sum[i], load<V>(row + i * L), weight + i * L, step);
           }
           row += lanes;
           weight += tap_step;
@@ -102,10 +107,8 @@ void lane_matrix_gradient(const LaneBlock& block, int count, const T* gradient, 
             sum += load<V>(from + j * gradient_row) * load<V>(weight + j * step);
           }
         } else {
-          sum = spread<0, T, L>(g) * load<V>(weight);
-          sum += spread<1, T, L>(g) * load<V>(weight + step);
-          sum += spread<2, T, L>(g) * load<V>(weight + 2 * step);
-          sum += spread<3, T, L>(g) * load<V>(weight + 3 * step);
+          sum = V{};
+          add_lanes<MIX>(sum, g, weight, step);
         }
         store(row, sum);
         row += lanes;

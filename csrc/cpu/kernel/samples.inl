@@ -29,10 +29,22 @@ struct AxisTable {
   }
 };
 
-// Byte steps of an axis. Rows of the gradient may lie apart: write_rows lists them.
+// Where rows of the gradient lie, in bytes from the image's first row of the pass: a task's own
+// rows in place, the ones before and after them apart.
+struct RowPlaces {
+  int64_t begin = 0, end = 0;  // own rows
+  int64_t step = 0;
+  int64_t before = 0, own = 0, after = 0;  // where row 0 would be in each
+
+  int64_t operator()(int64_t row) const {
+    return row * step + (row < begin ? before : (row < end ? own : after));
+  }
+};
+
+// Byte steps of an axis; places: of the gradient's rows, or null.
 struct AxisSteps {
   int64_t read = 0, pixel = 0;
-  const int64_t* write_rows = nullptr;
+  const RowPlaces* places = nullptr;
 };
 
 // (lo + side) * step; a step of 32 bits lets a narrow Int use the widening multiply.
@@ -111,13 +123,11 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict sca
     const int sides = axis.fixed(t) ? 1 : 2;
     fill_offsets(lo, sides, steps.read, table.read + at);
     if (steps.pixel != 0) fill_offsets(lo, sides, steps.pixel, table.pixel + at);
-    if (steps.write_rows != nullptr) {
+    if (steps.places != nullptr) {
+      const RowPlaces places = *steps.places;
       for (int side = 0; side < sides; ++side) {
-        for (int m = 0; m < kTile; ++m) {
-          const bool in = inside[side * kTile + m] != 0;
-          table.write[at + side * kTile + m] =
-              in ? steps.write_rows[static_cast<int64_t>(lo[m]) + side] : 0;
-        }
+        int64_t* __restrict write = table.write + at + side * kTile;
+        for (int m = 0; m < kTile; ++m) write[m] = places(static_cast<int64_t>(lo[m]) + side);
       }
     }
   }
