@@ -116,31 +116,41 @@ SURFCONV_INLINE void transpose_8x8(const float* from, int64_t from_row, float* t
   }
 }
 
-// to[column * to_row + row] = from[row * from_row + column]
-template <class T>
-void transpose(const T* from, int64_t from_row, int64_t rows, int64_t columns, T* to,
-               int64_t to_row) {
-  constexpr int64_t step = sizeof(T) == 4 && kLanes<T> >= 8 ? 8 : 4;
-  int64_t column = 0;
-  for (; column + step <= columns; column += step) {
-    int64_t row = 0;
-    for (; row + step <= rows; row += step) {
-      const T* block = from + row * from_row + column;
-      if constexpr (step == 8) {
-        transpose_8x8(block, from_row, to + column * to_row + row, to_row);
+// to[column * to_row + row] = from[row * from_row + column] in whole blocks of SIZE x SIZE from
+// (row, column) on; returns where the blocks end.
+template <int SIZE, class T>
+int64_t transpose_blocks(const T* from, int64_t from_row, int64_t row, int64_t rows, int64_t column,
+                         int64_t columns, T* to, int64_t to_row) {
+  const int64_t end = row + (rows - row) / SIZE * SIZE;
+  for (; column + SIZE <= columns; column += SIZE) {
+    for (int64_t r = row; r < end; r += SIZE) {
+      const T* block = from + r * from_row + column;
+      if constexpr (SIZE == 8) {
+        transpose_8x8(block, from_row, to + column * to_row + r, to_row);
       } else {
-        transpose_4x4(block, from_row, to + column * to_row + row, to_row);
-      }
-    }
-    for (; row < rows; ++row) {
-      for (int64_t i = column; i < column + step; ++i) {
-        to[i * to_row + row] = from[row * from_row + i];
+        transpose_4x4(block, from_row, to + column * to_row + r, to_row);
       }
     }
   }
-  for (; column < columns; ++column) {
-    for (int64_t row = 0; row < rows; ++row)
-      to[column * to_row + row] = from[row * from_row + column];
+  return end;
+}
+
+template <class T>
+void transpose(const T* from, int64_t from_row, int64_t rows, int64_t columns, T* to,
+               int64_t to_row) {
+  int64_t row = 0;
+  if constexpr (sizeof(T) == 4 && kLanes<T> >= 8) {
+    row = transpose_blocks<8>(from, from_row, 0, rows, 0, columns, to, to_row);
+    if (columns % 8 >= 4) {
+      transpose_blocks<4>(from, from_row, 0, row, columns / 8 * 8, columns, to, to_row);
+    }
+  }
+  row = transpose_blocks<4>(from, from_row, row, rows, 0, columns, to, to_row);
+  const int64_t column = columns / 4 * 4;
+  for (int64_t r = 0; r < rows; ++r) {
+    for (int64_t c = r < row ? column : 0; c < columns; ++c) {
+      to[c * to_row + r] = from[r * from_row + c];
+    }
   }
 }
 
