@@ -27,9 +27,17 @@ class Backward {
     if (tensors_.grad_scale.data != nullptr) {
       int64_t most = 0;
       for (const Pass& pass : passes) most = std::max(most, pass.images * scale_elements(pass));
-      grad_scale_.reset(new T[static_cast<size_t>(units() * most)]);
+      grad_scale_ = Buffer<T>(units() * most);
     }
-    std::vector<T> partials;  // [slot][weights, then bias]
+    std::vector<std::vector<Slot>> slots;  // of each pass
+    size_t most_slots = 1;
+    for (const Pass& pass : passes) {
+      slots.push_back(
+          make_slots<T>(conv_, tensors_.scale, pass, slots_wanted_, grad_input_.needed()));
+      most_slots = std::max(most_slots, slots.back().size());
+    }
+    partials_ = Buffer<T>(static_cast<int64_t>(most_slots) * partial_elements());
+    clear_partials(static_cast<int64_t>(most_slots));
     for (size_t i = 0; i < passes.size(); ++i) {
       const Pass& pass = passes[i];
       const auto same_image = [&](size_t other) {
@@ -41,17 +49,13 @@ class Backward {
       input_.pack(pass, executor_);
       guide_.pack(pass);
       grad_input_.begin(pass, previous, executor_);
-      std::vector<Slot> slots =
-          make_slots<T>(conv_, tensors_.scale, pass, slots_wanted_, grad_input_.needed());
-      partials.resize(std::max(partials.size(), slots.size() * partial_elements()), T(0));
-      lay_out_spill(pass, slots);
-      run_slots(pass, slots, partials.data());
-      add_spill(pass, slots);
+      lay_out_spill(pass, slots[i]);
+      run_slots(pass, slots[i]);
+      add_spill(pass, slots[i]);
       grad_input_.end(pass, previous == nullptr, same_image(i + 1), executor_);
       if (tensors_.grad_scale.data != nullptr) store_scale(pass);
     }
-    partials.resize(std::max(partials.size(), static_cast<size_t>(partial_elements())), T(0));
-    store_weights(partials.data(), static_cast<int64_t>(partials.size() / partial_elements()));
+    store_weights(static_cast<int64_t>(most_slots));
   }
 
  private:
@@ -61,8 +65,13 @@ class Backward {
   int64_t scale_elements(const Pass& pass) const {
     return conv_.scale_components * pass.out.count() * conv_.x.out;
   }
-  size_t partial_elements() const {
-    return static_cast<size_t>(weight_elements_ + tile_.bias_elements());
+  int64_t partial_elements() const { return weight_elements_ + tile_.bias_elements(); }
+
+  void clear_partials(int64_t slots) {
+    const int64_t elements = partial_elements();
+    run_tasks(
+        executor_, slots, workers_for(executor_, slots, slots * elements / 4),
+        [&](int, int64_t slot) { std::fill_n(partials_.get() + slot * elements, elements, T(0)); });
   }
 
   // Gives each slot the place of every input row that it scatters to.
@@ -71,7 +80,8 @@ class Backward {
     int64_t spilled = 0;
     for (const Slot& slot : slots) spilled += slot.spilled();
     const int64_t elements = grad_input_.row_elements();
-    spill_.reset(spilled > 0 ? new T[static_cast<size_t>(spilled * elements)]() : nullptr);
+    spill_ = spilled > 0 ? Buffer<T>(spilled * elements) : Buffer<T>();
+    if (spill_) std::fill_n(spill_.get(), spilled * elements, T(0));
     T* next = spill_.get();
     for (Slot& slot : slots) {
       const int64_t n = pass.first_image + slot.first_image;
@@ -106,7 +116,7 @@ class Backward {
     });
   }
 
-  void run_slots(const Pass& pass, const std::vector<Slot>& slots, T* partials) {
+  void run_slots(const Pass& pass, const std::vector<Slot>& slots) {
     const Plan& plan = tile_.plan();
     const int64_t tasks = static_cast<int64_t>(slots.size()) * units();
     const int64_t pixels = pass.images * pass.out.count() * conv_.x.out;
@@ -119,7 +129,7 @@ class Backward {
     run_tasks(executor_, tasks, workers, [&](int worker, int64_t task) {
       const int64_t unit = task % units(), index = task / units();
       run_slot(scratch[static_cast<size_t>(worker)], pass, slots[static_cast<size_t>(index)], unit,
-               partials + static_cast<size_t>(index) * partial_elements());
+               partials_.get() + index * partial_elements());
     });
   }
 
@@ -169,8 +179,9 @@ class Backward {
     }
   }
 
-  void store_weights(T* partials, int64_t slots) {
-    const int64_t elements = static_cast<int64_t>(partial_elements());
+  void store_weights(int64_t slots) {
+    T* const partials = partials_.get();
+    const int64_t elements = partial_elements();
     constexpr int64_t kSpan = 4096;
     const int64_t tasks = (elements + kSpan - 1) / kSpan;
     run_tasks(executor_, tasks, workers_for(executor_, tasks, slots * elements / 4),
@@ -216,7 +227,8 @@ class Backward {
   InputRows<T> input_;
   GuideRows<T> guide_;
   GradientRows<T> grad_input_;
-  std::unique_ptr<T[]> grad_scale_, spill_;
+  Buffer<T> grad_scale_, spill_;
+  Buffer<T> partials_;  // [slot][weights, then bias]
   std::vector<int64_t> weight_offset_;
   int64_t weight_elements_ = 0;
 };

@@ -111,7 +111,7 @@ class BackwardTile {
     const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
     const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
     stride_ = pad_width<T>(taps_ * std::min(kBlock, to_quads(plan_.channels))) * plan_.outputs;
-    weights_.reset(new T[static_cast<size_t>(tasks * stride_)]);
+    weights_ = Buffer<T>(tasks * stride_);
     run_tasks(
         executor, tasks, workers_for(executor, tasks, tasks * stride_), [&](int, int64_t task) {
           const int64_t first_tap = task % tap_blocks * taps_;
@@ -353,6 +353,6 @@ class BackwardTile {
   const bool in_place_;  // the gradient of the output may be read where it lies
   const bool needs_matrix_;
   const std::vector<T> zeros_;
-  std::unique_ptr<T[]> weights_;
+  Buffer<T> weights_;
   int64_t stride_ = 0;
 };

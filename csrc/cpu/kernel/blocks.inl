@@ -161,9 +161,10 @@ SURFCONV_INLINE void for_lane_weights(const Conv& conv, const Plan& plan, const 
 
 // Weights as [tap][k][row].
 template <class T, bool Back>
-std::unique_ptr<T[]> pack_lanewise(const Conv& conv, const Plan& plan, const View& weight) {
+Buffer<T> pack_lanewise(const Conv& conv, const Plan& plan, const View& weight) {
   const int64_t step = plan.weights_of_tap() * plan.row;
-  std::unique_ptr<T[]> packed(new T[static_cast<size_t>(plan.taps * step)]());
+  Buffer<T> packed(plan.taps * step);
+  std::fill_n(packed.get(), plan.taps * step, T(0));
   visit_storage<T>(weight, [&](auto* data) {
     for_lane_weights<Back>(conv, plan, [&](int64_t o, int64_t c, int64_t k, int64_t lane) {
       const auto* filter = data + o * weight.n + c * weight.c;

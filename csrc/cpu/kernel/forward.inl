@@ -91,7 +91,7 @@ class Forward {
       return;
     }
     const int64_t depth = plan_.taps * plan_.row;
-    weights_.reset(new T[static_cast<size_t>(depth * width_)]);
+    weights_ = Buffer<T>(depth * width_);
     const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
     const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
     run_tasks(executor_, tasks, workers_for(executor_, tasks, depth * width_),
@@ -204,7 +204,7 @@ class Forward {
   const bool writes_rows_, prefetches_;
   std::vector<T> unseen_;  // what a corner outside the image reads
   std::vector<T> initial_;
-  std::unique_ptr<T[]> weights_;
+  Buffer<T> weights_;
 };
 
 void forward(const Conv& conv, const ForwardTensors& tensors, const Executor& executor) {

@@ -16,7 +16,7 @@ class GradientRows {
   int64_t row_elements() const { return conv_.x.in * plan_.row; }
 
   void reserve(const std::vector<Pass>& passes) {
-    if (copies()) memory_.reset(new T[static_cast<size_t>(most_rows(passes) * row_elements())]);
+    if (copies()) memory_ = Buffer<T>(most_rows(passes) * row_elements());
   }
 
   // Row y of image n, a row of the pass.
@@ -78,5 +78,5 @@ class GradientRows {
   const Plan& plan_;
   const View& gradient_;
   const bool in_place_;
-  std::unique_ptr<T[]> memory_;
+  Buffer<T> memory_;
 };

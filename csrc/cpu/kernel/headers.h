@@ -6,9 +6,9 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
-#include <memory>
-#include <new>
 #include <type_traits>
+#include <utility>
 #include <vector>
 
+#include "../memory.h"
 #include "../surf_conv2d.h"

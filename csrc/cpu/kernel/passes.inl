@@ -99,7 +99,7 @@ class InputRows {
   int64_t step_y() const { return packed_ ? row_elements() : input_.y; }
 
   void reserve(const std::vector<Pass>& passes) {
-    if (packed_) memory_.reset(new T[static_cast<size_t>(most_rows(passes) * row_elements())]);
+    if (packed_) memory_ = Buffer<T>(most_rows(passes) * row_elements());
   }
 
   // Where row 0 of image n would lie; only rows of the pass are there.
@@ -131,7 +131,7 @@ class InputRows {
   const Plan& plan_;
   const View& input_;
   const bool packed_;
-  std::unique_ptr<T[]> memory_;
+  Buffer<T> memory_;
 };
 
 // The guide in the compute type, one value a pixel, whole images.
@@ -147,7 +147,7 @@ class GuideRows {
   void pack(const Pass& pass) {
     const int64_t pixels = conv_.y.in * conv_.x.in;
     if (!packed_ || (packed_image_ == pass.first_image && memory_)) return;
-    memory_.reset(new T[static_cast<size_t>(pass.images * pixels)]);
+    memory_ = Buffer<T>(pass.images * pixels);
     packed_image_ = pass.first_image;
     for (int64_t n = 0; n < pass.images; ++n) {
       load_pixels<T>(guide_, pass.first_image + n, 0, 1, conv_.x.in, 0, pixels,
@@ -165,5 +165,5 @@ class GuideRows {
   const View& guide_;
   const bool packed_;
   int64_t packed_image_ = -1;
-  std::unique_ptr<T[]> memory_;
+  Buffer<T> memory_;
 };

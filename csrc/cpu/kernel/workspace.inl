@@ -1,9 +1,27 @@
-// Uninitialised scratch, one allocation cut into 64-byte aligned pieces.
+// Uninitialised memory of a call.
+template <class T>
+class Buffer {
+ public:
+  Buffer() = default;
+  explicit Buffer(int64_t count) : block_(take_block(static_cast<size_t>(count) * sizeof(T))) {}
+  Buffer(Buffer&& other) noexcept : block_(std::exchange(other.block_, {})) {}
+  Buffer& operator=(Buffer&& other) noexcept {
+    std::swap(block_, other.block_);
+    return *this;
+  }
+  ~Buffer() { return_block(block_); }
+
+  T* get() const { return static_cast<T*>(block_.data); }
+  explicit operator bool() const { return block_.data != nullptr; }
+
+ private:
+  Block block_;
+};
+
+// Scratch, one buffer cut into 64-byte aligned pieces.
 class Workspace {
  public:
-  explicit Workspace(int64_t bytes) : memory_(new char[static_cast<size_t>(bytes) + 64]) {
-    next_ = memory_.get() + (64 - reinterpret_cast<uintptr_t>(memory_.get()) % 64) % 64;
-  }
+  explicit Workspace(int64_t bytes) : memory_(bytes), next_(memory_.get()) {}
   template <class U>
   static int64_t need(int64_t count) {
     return round_up(count * static_cast<int64_t>(sizeof(U)), 64);
@@ -16,7 +34,7 @@ class Workspace {
   }
 
  private:
-  std::unique_ptr<char[]> memory_;
+  Buffer<char> memory_;
   char* next_;
 };
 
