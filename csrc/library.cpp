@@ -2,6 +2,7 @@
 // ones. Full error messages live in the Python validator that every backend shares.
 #include <torch/csrc/stable/library.h>
 
+#include "level_values.h"
 #include "surf_conv2d.h"
 
 STABLE_TORCH_LIBRARY(surfconv, m) {
@@ -13,12 +14,14 @@ STABLE_TORCH_LIBRARY(surfconv, m) {
       "Tensor? guide, float guide_tolerance, int[] stride, int[] padding, int[] dilation, "
       "int groups, bool need_input, bool need_weight, bool need_bias, bool need_scale) "
       "-> (Tensor, Tensor, Tensor, Tensor)");
+  m.def("level_values(Tensor depth, Tensor edges, Tensor values) -> Tensor");
   m.def("cpu_capability() -> str");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(surfconv, CPU, m) {
   m.impl("surf_conv2d", TORCH_BOX(&surfconv::surf_conv2d));
   m.impl("surf_conv2d_backward", TORCH_BOX(&surfconv::surf_conv2d_backward));
+  m.impl("level_values", TORCH_BOX(&surfconv::level_values));
 }
 
 STABLE_TORCH_LIBRARY_IMPL(surfconv, CompositeExplicitAutograd, m) {

@@ -22,6 +22,7 @@ BACKWARD_SCHEMA = (
     " int groups, bool need_input, bool need_weight, bool need_bias, bool need_scale)"
     " -> (Tensor, Tensor, Tensor, Tensor)"
 )
+LEVEL_VALUES_SCHEMA = "level_values(Tensor depth, Tensor edges, Tensor values) -> Tensor"
 
 _warned = False
 
@@ -117,10 +118,18 @@ def _backward(
     return grad_input, grad_weight, grad_bias, grad_scale
 
 
+def level_values(depth: Tensor, edges: Tensor, values: Tensor) -> Tensor:
+    """``values[level]`` of every depth; the last value stands where a depth is invalid."""
+    level = torch.bucketize(depth, edges)
+    return values[torch.where((depth > 0) & depth.isfinite(), level, -1)]
+
+
 def register(library: torch.library.Library) -> None:
     """Register the reference as the kernel of every device that has none of its own."""
     if missing_library_reason is not None:
         library.define(FORWARD_SCHEMA)
         library.define(BACKWARD_SCHEMA)
+        library.define(LEVEL_VALUES_SCHEMA)
     library.impl("surf_conv2d", _forward, "CompositeExplicitAutograd")
     library.impl("surf_conv2d_backward", _backward, "CompositeExplicitAutograd")
+    library.impl("level_values", level_values, "CompositeExplicitAutograd")

@@ -94,8 +94,7 @@ def depth_to_scale(
     references = reference if isinstance(reference, tuple) else (reference,)
     limits = ScaleLimits(invalid_scale, min_scale, min(max_scale, torch.finfo(dtype).max))
     if levels is not None:
-        level = levels.assign(depth)
-        scales = [_of_levels(r, levels, level, dtype, limits) for r in references]
+        scales = [_of_levels(r, levels, depth, limits) for r in references]
     elif depth.requires_grad and torch.is_grad_enabled():
         scales = [_differentiable(r, depth.to(dtype), depth.dtype, limits) for r in references]
     else:
@@ -119,11 +118,11 @@ def _of_depth(reference: float, metres: Tensor, limits: ScaleLimits) -> Tensor:
 
 
 def _of_levels(
-    reference: float, levels: DepthLevels, level: Tensor, dtype: torch.dtype, limits: ScaleLimits
+    reference: float, levels: DepthLevels, depth: Tensor, limits: ScaleLimits
 ) -> Tensor:
     """One scale per level; level -1 indexes the last entry, so the invalid scale stands there."""
     scales = [min(max(reference / c, limits.low), limits.high) for c in levels.centers]
-    return torch.tensor((*scales, limits.invalid), dtype=dtype, device=level.device)[level]
+    return levels.look_up(depth, scales, limits.invalid)
 
 
 def _differentiable(

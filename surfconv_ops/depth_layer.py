@@ -105,8 +105,8 @@ class DepthLayer(nn.Module):
     def _guide(self, depth: Tensor) -> tuple[Tensor | None, float]:
         """What a tap may see, NaN where the depth is invalid, and the guide's tolerance."""
         if self.levels is not None and self.same_level_only:
-            level = self.levels.assign(depth)
-            return torch.where(level >= 0, level.to(torch.float32), math.nan), 0.0
+            level = self.levels.look_up(depth, range(len(self.levels)), math.nan)
+            return level.to(torch.float32), 0.0
         if self.depth_window is not None:
             depth = depth.detach()
             return torch.where(valid_depth(depth), depth, math.nan), self.depth_window

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from . import _fallback
 from .checks import check_depth_tensor, check_finite, check_positive
 
 _FORMAT = "surfconv_ops.DepthLevels"
@@ -94,13 +95,37 @@ class DepthLevels:
             >>> DepthLevels([2.0], [1.0, 3.0]).assign(torch.tensor([1.0, 5.0]))
             tensor([0, 1])
         """
+        return self.look_up(depth, range(len(self)), -1).to(torch.int64)
+
+    def look_up(self, depth: Tensor, values: Iterable[float], invalid: float) -> Tensor:
+        """A number for every pixel by its level.
+
+        Args:
+            depth: Depth in metres, floating point, any shape.
+            values: One number a level.
+            invalid: The number where the depth is invalid.
+
+        Returns:
+            The numbers, of the same shape: float64 for float64 depth, float32 for all others.
+            They carry no gradient.
+
+        Raises:
+            TypeError: ``depth`` is not a floating-point tensor.
+
+        Example:
+            >>> DepthLevels([2.0], [1.0, 3.0]).look_up(torch.tensor([1.5, 5.0, 0.0]), (7, 8), 9)
+            tensor([7., 8., 9.])
+        """
         depth = check_depth_tensor(depth).detach()
         double = depth.dtype == torch.float64
         wide = depth if double else depth.to(torch.float32)
         edges = self.edges if double else self._single_edges
         boundaries = torch.tensor(edges, dtype=wide.dtype, device=wide.device)
-        level = torch.bucketize(wide, boundaries)
-        return torch.where(valid_depth(depth), level, -1)
+        table = torch.tensor((*values, invalid), dtype=wide.dtype, device=wide.device)
+        # A compiler fuses the plain form with what surrounds it.
+        plain = torch.compiler.is_compiling()
+        call = _fallback.level_values if plain else torch.ops.surfconv.level_values
+        return call(wide, boundaries, table)
 
     def quantize(self, depth: Tensor) -> Tensor:
         """The representative depth of every pixel's level.
@@ -119,11 +144,7 @@ class DepthLevels:
             >>> DepthLevels([2.0], [1.0, 3.0]).quantize(torch.tensor([1.5, 5.0]))
             tensor([1., 3.])
         """
-        level = self.assign(depth)
-        dtype = torch.float64 if depth.dtype == torch.float64 else torch.float32
-        # Level -1 indexes the last entry, so NaN stands there.
-        table = torch.tensor((*self.centers, math.nan), dtype=dtype, device=depth.device)
-        return table[level]
+        return self.look_up(depth, self.centers, math.nan)
 
     def to_dict(self) -> dict[str, Any]:
         """Edges, centers and gamma as plain numbers and lists."""
@@ -169,7 +190,7 @@ class DepthLevels:
 
 def valid_depth(depth: Tensor) -> Tensor:
     """Where a depth is positive and finite."""
-    return (depth > 0) & depth.isfinite()
+    return (depth > 0) & (depth < math.inf)
 
 
 def _round_down(edges: tuple[float, ...]) -> tuple[float, ...]:

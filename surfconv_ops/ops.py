@@ -94,6 +94,18 @@ def _fake_backward(
     )
 
 
+@torch.library.register_fake("surfconv::level_values", lib=_library)
+def _fake_level_values(depth: Tensor, edges: Tensor, values: Tensor) -> Tensor:
+    return depth.new_empty(depth.shape)
+
+
+@torch.library.register_vmap("surfconv::level_values", lib=_library)
+def _vmap_level_values(
+    info: Any, in_dims: tuple[int | None, ...], depth: Tensor, edges: Tensor, values: Tensor
+) -> tuple[Tensor, int | None]:
+    return torch.ops.surfconv.level_values(depth, edges, values), in_dims[0]
+
+
 def _save_forward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     input, weight, _, scale, guide, *options = inputs
     ctx.save_for_backward(input, weight, scale, guide)

@@ -14,6 +14,7 @@ SOURCE = Path(__file__).parent.parent / "csrc" / "library.cpp"
 SCHEMAS = {
     "surf_conv2d": _fallback.FORWARD_SCHEMA,
     "surf_conv2d_backward": _fallback.BACKWARD_SCHEMA,
+    "level_values": _fallback.LEVEL_VALUES_SCHEMA,
 }
 
 

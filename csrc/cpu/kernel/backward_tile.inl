@@ -145,7 +145,8 @@ class BackwardTile {
       with_needs(target, [&](auto writes, auto slopes) {
         constexpr bool Writes = decltype(writes)::value;
         constexpr Slopes S = decltype(slopes)::value;
-        if (!scratch.tile.interior()) {
+        const bool kinks = S != Slopes::none && scratch.tile.has(Place::on_grid);
+        if (kinks || scratch.tile.has(Place::other)) {
           scratch.tile.template fill_taps<Writes, S>(first_tap, taps, unseen_read, unseen_write);
         }
         T* weight = target.weight;

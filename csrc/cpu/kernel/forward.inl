@@ -129,8 +129,8 @@ class Forward {
     }
     for (int64_t first_tap = 0; first_tap < plan_.taps; first_tap += taps_) {
       const int64_t taps = std::min(taps_, plan_.taps - first_tap);
-      if (fused && scratch.tile.interior()) break;
-      if (!scratch.tile.interior()) {
+      if (fused && scratch.tile.all(Place::interior)) break;
+      if (scratch.tile.has(Place::other)) {
         scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
       }
       for (const ChannelBlock& block : blocks_) {
@@ -175,7 +175,7 @@ class Forward {
       };
       if (!fused) return multiply(0, count);
       scratch.tile.for_runs([&](const Run& run) {
-        if (!run.interior) multiply(run.begin, run.end);
+        if (run.place != Place::interior) multiply(run.begin, run.end);
       });
     });
   }

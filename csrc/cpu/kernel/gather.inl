@@ -81,6 +81,23 @@ void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, 
   }
 }
 
+template <class T, class Channels>
+void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+                 const char* base, int begin, int end, Channels channels, T* to, int64_t ld) {
+  const Axis axis_y = conv.y, axis_x = conv.x;
+  for (int m = begin; m < end; ++m) {
+    T* out = to + m * ld;
+    walk_grid(axis_y, axis_x, rows, columns, taps_y, m,
+              [&](const TapSide<T>& y, const TapSide<T>& x, int64_t t) SURFCONV_INLINED {
+                T* place = out + t * count_of(channels);
+                const T* from = reinterpret_cast<const T*>(base + y.read[0] + x.read[0]);
+                for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
+                  store(place + c, load<Vec<T, decltype(width)::lanes>>(from + c));
+                });
+              });
+  }
+}
+
 // The gathered matrix of a tile: `taps` from first_tap on, of `channels` each; interior pixels only
 // if wanted.
 template <class T>
@@ -88,14 +105,18 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
                  const char* base, int64_t channels, T* to, int64_t ld, bool interior = true) {
   const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
   tile.for_runs([&](const Run& run) {
-    if (!run.interior) {
+    if (run.place == Place::other) {
       for (int64_t t = 0; t < taps; ++t) {
         gather_tap(tile.tap(t), base, run.begin, run.end, channels, to + t * channels, ld);
       }
       return;
     }
-    if (!interior) return;
+    if (run.place == Place::interior && !interior) return;
     with_channels<T>(channels, [&](auto known) {
+      if (run.place == Place::on_grid) {
+        return gather_grid(conv, tile.rows(), tile.columns(), taps_y, base, run.begin, run.end,
+                           known, to, ld);
+      }
       with_width(conv.x.kernel, [&](auto width) {
         gather_interior<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y, base,
                                                 run.begin, run.end, known, to, ld);

@@ -51,7 +51,7 @@ void lane_forward(const Conv& conv, const Plan& plan, const Tile<T>& tile, const
   with_width(conv.x.kernel, [&](auto width) {
     for_fixed_lanes<T>(plan.row, [&](int64_t c, auto lanes) {
       tile.for_runs([&](const Run& run) {
-        if (!run.interior) return;
+        if (run.place != Place::interior) return;
         lane_interior<decltype(width)::value>(
             conv, tile.rows(), tile.columns(), base + c * static_cast<int64_t>(sizeof(T)),
             run.begin, run.end, lanes, weights + c, plan.row, out + c, ld_out);

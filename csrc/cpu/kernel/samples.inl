@@ -62,11 +62,21 @@ SURFCONV_INLINE void fill_offsets(const Int* __restrict lo, int sides, int64_t s
   }
 }
 
-// One tap of all pixels: the lower pixel, then weight and presence of both. lowest: of all weights.
+// What the weights of a pixel's taps have in common, both axes together.
+template <class T>
+struct WeightBounds {
+  T lowest[kTile];   // of all weights: positive where every tap lies between pixels of the image
+  T nearest[kTile];  // of each tap's side towards the centre: 1 where every tap lies on a pixel of
+                     // it
+};
+
+// One tap of all pixels: the lower pixel, then weight and presence of both.
 template <bool Descending, class T, class Int>
 void locate_tile(T half, T tap, Int size, const T* __restrict scale, const Int* __restrict centre,
                  Int* __restrict lo, T* __restrict weight, T* __restrict inside,
-                 T* __restrict lowest) {
+                 WeightBounds<T>& bounds) {
+  T* __restrict lowest = bounds.lowest;
+  T* __restrict nearest = bounds.nearest;
   // g++ 12 takes comparisons of longer vectors apart, lane by lane.
   constexpr int most = std::min(SURFCONV_VECTOR_BYTES, 32) / static_cast<int>(sizeof(T));
   constexpr int lanes = sizeof(T) == sizeof(Int) ? most : 1;
@@ -92,14 +102,17 @@ void locate_tile(T half, T tap, Int size, const T* __restrict scale, const Int* 
     store(weight + m, weight_lo);
     store(weight + kTile + m, weight_hi);
     const Real both = weight_lo < weight_hi ? weight_lo : weight_hi;
-    const Real before = load<Real>(lowest + m);
-    store(lowest + m, Real(both < before ? both : before));
+    const Real low = load<Real>(lowest + m);
+    store(lowest + m, Real(both < low ? both : low));
+    const Real side = Descending ? weight_hi : weight_lo;
+    const Real near = load<Real>(nearest + m);
+    store(nearest + m, Real(side < near ? side : near));
   }
 }
 
 template <class T, class Int>
 void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict scale,
-               const Int* __restrict centre, const AxisTable<T>& table, T* __restrict lowest) {
+               const Int* __restrict centre, const AxisTable<T>& table, WeightBounds<T>& bounds) {
   const T half = axis.centre_is_half() ? T(0.5) : T(0);
   const Int size = static_cast<Int>(axis.in);
   for (int64_t t = 0; t < axis.kernel; ++t) {
@@ -109,16 +122,20 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict sca
     T* __restrict weight = table.weight + at;
     T* __restrict inside = table.inside + at;
     if (axis.fixed(t)) {
+      T* __restrict lowest = bounds.lowest;
+      T* __restrict nearest = bounds.nearest;
       for (int m = 0; m < kTile; ++m) {
         const bool in = (centre[m] >= 0) & (centre[m] < size);
         lo[m] = in ? centre[m] : 0;
-        weight[m] = inside[m] = in ? T(1) : T(0);
-        lowest[m] = std::min(lowest[m], weight[m]);
+        const T present = in ? T(1) : T(0);
+        weight[m] = inside[m] = present;
+        lowest[m] = lowest[m] < present ? lowest[m] : present;
+        nearest[m] = nearest[m] < present ? nearest[m] : present;
       }
     } else if (tap < 0) {
-      locate_tile<true>(half, tap, size, scale, centre, lo, weight, inside, lowest);
+      locate_tile<true>(half, tap, size, scale, centre, lo, weight, inside, bounds);
     } else {
-      locate_tile<false>(half, tap, size, scale, centre, lo, weight, inside, lowest);
+      locate_tile<false>(half, tap, size, scale, centre, lo, weight, inside, bounds);
     }
     const int sides = axis.fixed(t) ? 1 : 2;
     fill_offsets(lo, sides, steps.read, table.read + at);

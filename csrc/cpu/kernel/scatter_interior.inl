@@ -75,13 +75,35 @@ void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns,
   }
 }
 
+// Pixels on the grid, where the scale's gradient is not wanted: on a kink the sides would differ.
+template <class T, class Channels>
+void scatter_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+                  ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
+                  int64_t ld) {
+  const Axis axis_y = conv.y, axis_x = conv.x;
+  for (int m = begin; m < end; ++m) {
+    T* row = matrix + m * ld;
+    walk_grid(axis_y, axis_x, rows, columns, taps_y, m,
+              [&](const TapSide<T>& y, const TapSide<T>& x, int64_t t) SURFCONV_INLINED {
+                T* place = row + t * count_of(channels);
+                const T* from = reinterpret_cast<const T*>(target.read + y.read[0] + x.read[0]);
+                T* to = reinterpret_cast<T*>(target.write + y.write[0] + x.read[0]);
+                for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
+                  using V = Vec<T, decltype(width)::lanes>;
+                  store(to + c, V(load<V>(to + c) + load<V>(place + c)));
+                  store(place + c, load<V>(from + c));
+                });
+              });
+  }
+}
+
 // All pixels of a tile: `taps` from first_tap on, of `channels` each.
 template <bool Writes, Slopes S, class T>
 void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64_t taps,
                   const ScatterTarget<T>& target, int64_t channels, T* matrix, int64_t ld) {
   const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
   tile.for_runs([&](const Run& run) {
-    if (!run.interior) {
+    if (run.place == Place::other || (run.place == Place::on_grid && S != Slopes::none)) {
       for (int64_t t = 0; t < taps; ++t) {
         scatter_tap<Writes, S>(tile.tap(t), target, run.begin, run.end, channels,
                                matrix + t * channels, ld);
@@ -89,6 +111,12 @@ void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int6
       return;
     }
     with_channels<T>(channels, [&](auto known) {
+      if constexpr (S == Slopes::none) {
+        if (run.place == Place::on_grid) {
+          return scatter_grid(conv, tile.rows(), tile.columns(), taps_y, target, run.begin, run.end,
+                              known, matrix, ld);
+        }
+      }
       with_width(conv.x.kernel, [&](auto width) {
         scatter_interior<Writes, S, decltype(width)::value>(conv, tile.rows(), tile.columns(),
                                                             taps_y, target, run.begin, run.end,

@@ -1,8 +1,12 @@
-// Successive pixels of a tile. Interior: every tap falls strictly between pixels of the image and
-// there is no guide, so that corners need no checks and their weights are products of the axes'.
+// Successive pixels of a tile that are alike.
+enum class Place : int8_t {
+  interior,  // every tap strictly between pixels of the image: weights are products of the axes'
+  on_grid,   // every tap on a pixel of the image, as at scale 1: one corner
+  other      // needs its corners listed: at the border, or not all of them are visible
+};
 struct Run {
   int begin, end;
-  bool interior;
+  Place place;
 };
 
 // One worker's view of the tile it is at: the geometry of up to kTile flat output pixels.
@@ -30,7 +34,13 @@ class Tile {
   SURFCONV_INLINE void for_runs(const Body& body) const {
     for (int i = 0; i < run_count_; ++i) body(runs_[i]);
   }
-  bool interior() const { return run_count_ == 1 && runs_[0].interior; }
+  bool all(Place place) const { return run_count_ == 1 && runs_[0].place == place; }
+  bool has(Place place) const {
+    for (int i = 0; i < run_count_; ++i) {
+      if (runs_[i].place == place) return true;
+    }
+    return false;
+  }
 
   // Flat output pixels first .. first+count-1 of image n.
   void place(const View& scale, const T* guide, int64_t n, int64_t first, int count,
@@ -46,21 +56,22 @@ class Tile {
     guide_.image = guide;
     guide_.tolerance = static_cast<T>(conv_.guide_tolerance);
     if (guide != nullptr) read_guide(guide, first, count);
-    T lowest[kTile];
-    std::fill_n(lowest, kTile, T(1));
+    WeightBounds<T> bounds;
+    std::fill_n(bounds.lowest, kTile, T(1));
+    std::fill_n(bounds.nearest, kTile, T(1));
     const auto fill = [&](auto index) {
       using Int = decltype(index);
       Int centre_y[kTile], centre_x[kTile];
       find_centres(first, count, centre_y, centre_x);
-      fill_axis<T, Int>(conv_.y, steps_y, scale_y, centre_y, rows_, lowest);
-      fill_axis<T, Int>(conv_.x, steps_x, scale_x, centre_x, columns_, lowest);
+      fill_axis<T, Int>(conv_.y, steps_y, scale_y, centre_y, rows_, bounds);
+      fill_axis<T, Int>(conv_.x, steps_x, scale_x, centre_x, columns_, bounds);
     };
     if (sizeof(T) == 4 && narrow_) {
       fill(std::conditional_t<sizeof(T) == 4, int32_t, int64_t>{});
     } else {
       fill(int64_t{});
     }
-    find_runs(lowest, count, guide == nullptr && has_whole_rows(conv_));
+    find_runs(bounds, count);
   }
 
   template <bool Writes, Slopes S>
@@ -118,21 +129,33 @@ class Tile {
     });
   }
 
-  void find_runs(const T* lowest, int count, bool possible) {
-    int interior = 0;
-    for (int m = 0; m < kTile; ++m) interior += lowest[m] > 0;
-    if (!possible || interior == 0 || interior == kTile) {
-      runs_[0] = {0, count, possible && interior != 0};
-      run_count_ = 1;
-      return;
-    }
-    run_count_ = 0;
-    for (int m = 0; m < count; ++m) {
-      const bool inside = lowest[m] > 0;
-      if (run_count_ == 0 || runs_[run_count_ - 1].interior != inside) {
-        runs_[run_count_++] = {m, m, inside};
+  void find_runs(const WeightBounds<T>& bounds, int count) {
+    static_assert(kTile < 64, "a bit for each pixel and the end");
+    const bool possible = has_whole_rows(conv_), guided = guide_.image != nullptr;
+    if (possible && !guided) {
+      int interior = 0;
+      for (int m = 0; m < kTile; ++m) interior += bounds.lowest[m] > 0;
+      if (interior == kTile) {
+        runs_[0] = {0, count, Place::interior};
+        run_count_ = 1;
+        return;
       }
-      runs_[run_count_ - 1].end = m + 1;
+    }
+    int32_t place[kTile];
+    for (int m = 0; m < kTile; ++m) {
+      const int32_t unseen = guided ? guide_.exempt[m] == 0 : 0;
+      const int32_t apart = bounds.lowest[m] <= 0, off_grid = bounds.nearest[m] < 1;
+      place[m] = (apart + (apart & off_grid)) | (unseen << 1);
+    }
+    uint64_t changes = uint64_t{1} << count;
+    for (int m = 1; m < count; ++m) changes |= static_cast<uint64_t>(place[m] != place[m - 1]) << m;
+    run_count_ = 0;
+    for (int begin = 0; begin < count;) {
+      const int end = __builtin_ctzll(changes);
+      const int32_t kind = possible ? std::min(place[begin], 2) : 2;
+      runs_[run_count_++] = {begin, end, static_cast<Place>(kind)};
+      changes &= changes - 1;
+      begin = end;
     }
   }
 

@@ -54,6 +54,22 @@ SURFCONV_INLINE void walk_taps(const Axis& axis_y, const Axis& axis_x, const Axi
   }
 }
 
+// body(y, x, t) for each tap of a pixel on the grid: the sides of one corner of weight 1.
+template <class T, class Body>
+SURFCONV_INLINE void walk_grid(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
+                               const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
+  // The side that lies towards the centre, the nearer one where the scale were a little larger.
+  const auto side = [&](const Axis& axis, const AxisTable<T>& table, int64_t t) SURFCONV_INLINED {
+    const int64_t at = (2 * t + (axis.tap_doubled(t) < 0)) * kTile + m;
+    return TapSide<T>{{table.read[at], 0}, {table.write[at], 0}, {T(1), T(0)}, T(0)};
+  };
+  int64_t t = 0;
+  for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty) {
+    const TapSide<T> y = side(axis_y, rows, ty);
+    for (int64_t tx = 0; tx < axis_x.kernel; ++tx, ++t) body(y, side(axis_x, columns, tx), t);
+  }
+}
+
 // The corners of a tap, row by row: where they are and what they weigh.
 template <int ROWS, int COLUMNS, class T>
 struct Corners {
