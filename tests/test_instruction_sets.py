@@ -14,7 +14,7 @@ HERE = Path(__file__).parent
 ALL = ["default", "avx2", "avx512"]
 BEST = torch.backends.cpu.get_cpu_capability().lower()
 AVAILABLE = ALL[: ALL.index(BEST) + 1] if BEST in ALL else ["default"]
-FILES = ["forward", "gradients", "channels"]
+FILES = ["forward", "gradients", "channels", "paths"]
 
 
 def environment(capability: str) -> dict[str, str]:
