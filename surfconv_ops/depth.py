@@ -117,9 +117,7 @@ def _of_depth(reference: float, metres: Tensor, limits: ScaleLimits) -> Tensor:
     return torch.where(valid_depth(metres), scale, limits.invalid)
 
 
-def _of_levels(
-    reference: float, levels: DepthLevels, depth: Tensor, limits: ScaleLimits
-) -> Tensor:
+def _of_levels(reference: float, levels: DepthLevels, depth: Tensor, limits: ScaleLimits) -> Tensor:
     """One scale per level; level -1 indexes the last entry, so the invalid scale stands there."""
     scales = [min(max(reference / c, limits.low), limits.high) for c in levels.centers]
     return levels.look_up(depth, scales, limits.invalid)

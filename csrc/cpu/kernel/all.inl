@@ -18,6 +18,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "forward.inl"
 #include "bands.inl"
 #include "gradient_rows.inl"
+#include "output_gradient.inl"
 #include "backward_tile.inl"
 #include "backward.inl"
 

@@ -3,24 +3,6 @@
 // order. For each tile: the gradient of the gathered matrix by one product, a pass that scatters
 // it, takes its dot product with the sample's slope and puts the gathered matrix in its place, and
 // the transposed product of that into grad_weight.
-struct Unit {
-  std::vector<ChannelBlock> blocks;
-};
-
-inline std::vector<Unit> make_units(const std::vector<ChannelBlock>& blocks, int64_t channels) {
-  std::vector<Unit> units;
-  int64_t filled = channels;
-  for (const ChannelBlock& block : blocks) {
-    if (filled >= channels) {
-      units.emplace_back();
-      filled = 0;
-    }
-    units.back().blocks.push_back(block);
-    filled += block.padded;
-  }
-  return units;
-}
-
 template <class T>
 class BackwardTile {
  public:
@@ -50,14 +32,11 @@ class BackwardTile {
         taps_(taps_at_once(conv, std::min(kBlock, to_quads(plan_.channels)))),
         swapped_(!plan_.lanewise &&
                  round_up(plan_.outputs, kSwappedRows) < pad_width<T>(plan_.outputs)),
-        width_(plan_.lanewise ? plan_.multiplier * kBlock : pad_width<T>(plan_.outputs)),
+        output_(conv, plan_, tensors.grad_output),
+        width_(output_.width()),
         ld_rows_(
             pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowPad)) +
             16),
-        in_place_((plan_.lanewise ? plan_.multiplier == 1 && plan_.row == conv.out_channels
-                                  : plan_.outputs == width_) &&
-                  tensors.grad_output.dtype == kComputeDType<T> && tensors.grad_output.c == 1 &&
-                  tensors.grad_output.y == tensors.grad_output.x * conv.x.out),
         needs_matrix_(tensors.grad_input.data != nullptr || tensors.grad_scale.data != nullptr),
         zeros_(static_cast<size_t>(std::max(plan_.row, ld_rows_) + 2 * kLanes<T>), T(0)) {}
 
@@ -135,8 +114,8 @@ class BackwardTile {
   void run(Scratch& scratch, const Unit& unit, const Target& target, const T* guide, int64_t n,
            int64_t begin, int count, const AxisSteps& steps_y, const AxisSteps& steps_x) const {
     scratch.tile.place(tensors_.scale, guide, n, begin, count, steps_y, steps_x);
-    const Gradients gradients = load_gradients(scratch, unit, n, begin, count);
-    if (target.bias != nullptr) add_bias(gradients, unit, count, target.bias);
+    const Gradients gradients = output_.read(unit, n, begin, count, scratch.grad_out);
+    if (target.bias != nullptr) output_.add_bias(gradients, unit, count, target.bias);
     std::fill(scratch.dot, scratch.dot + 2 * kTile * kLanes<T>, T(0));
     const int64_t unseen_read = byte_distance(target.input, zeros_.data());
     const int64_t unseen_write = byte_distance(target.grad_input, scratch.discard);
@@ -184,7 +163,7 @@ class BackwardTile {
   }
 
  private:
-  static constexpr int64_t kBlock = 64;
+  using Gradients = typename OutputGradient<T>::Part;
   static constexpr int kSwappedRows = 4;
 
   int64_t weight_row(const ChannelBlock& block) const {
@@ -211,79 +190,6 @@ class BackwardTile {
       }
     };
     target.grad_input != nullptr ? by_slopes(std::true_type{}) : by_slopes(std::false_type{});
-  }
-
-  // The gradient of the output at a tile's pixels: a pixel every `ld`, of lanes
-  // [multiplier][kBlock].
-  struct Gradients {
-    const T* data;
-    int64_t ld, group_step, first_group;
-
-    const T* of(const ChannelBlock& block) const {
-      return data + (block.group - first_group) * group_step;
-    }
-  };
-
-  // In place where whole blocks of the products may read it there.
-  Gradients load_gradients(Scratch& scratch, const Unit& unit, int64_t n, int64_t begin,
-                           int count) const {
-    const View& from = tensors_.grad_output;
-    const ChannelBlock& block = unit.blocks.front();
-    if (in_place_ && count % kRowPad == 0) {
-      const T* pixel = static_cast<const T*>(from.data) + n * from.n + begin * from.x;
-      const int64_t first = plan_.lanewise ? block.first : block.group * plan_.outputs;
-      return {pixel + first, from.x, plan_.outputs, block.group};
-    }
-    if (plan_.lanewise) {  // a unit of lanes is one block
-      for (int64_t j = 0; j < plan_.multiplier; ++j) {
-        load_lanes<T>(multiplied(from, plan_, j), plan_.out, n, block.first, block.padded,
-                      conv_.x.out, begin, count, scratch.grad_out + j * kBlock, width_);
-      }
-    } else {
-      for (int64_t g = block.group; g <= unit.blocks.back().group; ++g) {
-        load_pixels<T>(from, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin, count,
-                       scratch.grad_out + (g - block.group) * kTile * width_, width_, width_);
-      }
-    }
-    return {scratch.grad_out, width_, kTile * width_, block.group};
-  }
-
-  // to[c] += sum over pixels
-  static void add_columns(const T* from, int64_t ld, int count, int64_t columns, T* to) {
-    for_channels<T>(to_quads(columns), [&](int64_t c, auto width) SURFCONV_INLINED {
-      constexpr int L = decltype(width)::lanes;
-      using V = Vec<T, L>;
-      V even{}, odd{};
-      int m = 0;
-      for (; m + 1 < count; m += 2) {
-        even += load<V>(from + m * ld + c);
-        odd += load<V>(from + (m + 1) * ld + c);
-      }
-      if (m < count) even += load<V>(from + m * ld + c);
-      T sums[L];
-      store(sums, V(even + odd));
-      for (int i = 0; i < std::min<int64_t>(L, columns - c); ++i) to[c + i] += sums[i];
-    });
-  }
-
-  void add_bias(const Gradients& gradients, const Unit& unit, int count, T* bias) const {
-    for (const ChannelBlock& block : unit.blocks) {
-      const T* from = gradients.of(block);
-      if (!plan_.lanewise) {
-        if (block.first != 0) continue;
-        add_columns(from, gradients.ld, count, plan_.outputs, bias + block.group * plan_.outputs);
-        continue;
-      }
-      for (int64_t j = 0; j < plan_.multiplier; ++j) {
-        T sums[kBlock] = {};
-        add_columns(from + j * kBlock, gradients.ld, count, block.padded, sums);
-        for_lane_weights<false>(conv_, plan_, [&](int64_t o, int64_t c, int64_t k, int64_t lane) {
-          const int64_t at = lane - block.first;
-          const bool wanted = plan_.mix == 1 ? k == j : c == 0;
-          if (wanted && at >= 0 && at < block.padded) bias[o] += sums[at];
-        });
-      }
-    }
   }
 
   void matrix_gradient(Scratch& scratch, const Gradients& gradients, const Unit& unit,
@@ -350,8 +256,8 @@ class BackwardTile {
   const std::vector<Unit> units_;
   const int64_t taps_;
   const bool swapped_;  // partial grad_weight as [output][tap, channel]: few outputs, less padding
+  const OutputGradient<T> output_;
   const int64_t width_, ld_rows_;
-  const bool in_place_;  // the gradient of the output may be read where it lies
   const bool needs_matrix_;
   const std::vector<T> zeros_;
   Buffer<T> weights_;

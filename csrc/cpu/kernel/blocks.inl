@@ -73,6 +73,8 @@ struct Plan {
   int64_t weights_of_tap() const { return multiplier * mix; }
 };
 
+constexpr int64_t kBlock = 64;  // channels gathered at a time
+
 // A run of channels of one group.
 struct ChannelBlock {
   int64_t group, first, count, padded;

@@ -53,8 +53,6 @@ class Forward {
   }
 
  private:
-  static constexpr int64_t kBlock = 64;
-
   struct Scratch {
     Tile<T> tile;
     T* rows;  // gathered matrix [kTile][ld_rows]
