@@ -60,6 +60,13 @@ def test_kernels(place: str, kernel: int | tuple[int, int]) -> None:
     check(lay_scale(make_problem(1, 4, 5, SIZE, kernel, padding=padding), place))
 
 
+@pytest.mark.parametrize("channels", [44, 64])
+@pytest.mark.parametrize("out_channels", [5, 16, 33])
+def test_blocks_of_taps(channels: int, out_channels: int) -> None:
+    """More taps than are gathered at a time, in blocks that leave part of a product's rows."""
+    check(lay_scale(make_problem(1, channels, out_channels, (7, 8), 5, padding=2), "holes"))
+
+
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("per_group", [(1, 1), (1, 3), (2, 2), (3, 4), (4, 1), (4, 4), (5, 2)])
 @pytest.mark.parametrize("groups", [2, 9, 32])

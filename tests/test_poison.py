@@ -80,8 +80,16 @@ def test_scratch_memory() -> None:
     environment = os.environ | {"MALLOC_PERTURB_": "1", "OMP_NUM_THREADS": "1"}
     environment.pop("PYTEST_XDIST_WORKER", None)
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
-    files = [str(HERE / f"test_{name}.py") for name in ("channels", "forward", "gradients")]
-    selection = [*files, "-m", "core", "-k", "odd or ((geometry or guide or dtype) and public)"]
+    files = [
+        str(HERE / f"test_{name}.py") for name in ("channels", "forward", "gradients", "paths")
+    ]
+    selection = [
+        *files,
+        "-m",
+        "core",
+        "-k",
+        "odd or blocks or ((geometry or guide or dtype) and public)",
+    ]
     result = subprocess.run([*command, *selection], cwd=HERE.parent, env=environment,
                             capture_output=True, text=True, timeout=300, check=False)  # fmt: skip
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]

@@ -47,7 +47,8 @@ class BackwardTile {
   int64_t weight_elements(const ChannelBlock& block) const {
     if (plan_.lanewise) return plan_.taps * plan_.weights_of_tap() * block.padded;
     if (swapped_) return round_up(plan_.outputs, kSwappedRows) * weight_row(block);
-    return round_up(plan_.taps * block.padded, kRowPad) * width_;
+    // Each block of taps is padded by itself.
+    return (plan_.taps * block.padded + kRowPad) * width_;
   }
   int64_t weight_elements(const Unit& unit) const {
     int64_t total = 0;
