@@ -36,6 +36,7 @@ class Backward {
           make_slots<T>(conv_, tensors_.scale, pass, slots_wanted_, grad_input_.needed()));
       most_slots = std::max(most_slots, slots.back().size());
     }
+    if (grad_input_.needed()) spill_ = Buffer<T>(most_spilled(slots) * input_.row_elements());
     partials_ = Buffer<T>(static_cast<int64_t>(most_slots) * partial_elements());
     clear_partials(static_cast<int64_t>(most_slots));
     for (size_t i = 0; i < passes.size(); ++i) {
@@ -74,14 +75,24 @@ class Backward {
         [&](int, int64_t slot) { std::fill_n(partials_.get() + slot * elements, elements, T(0)); });
   }
 
+  // Rows of spill that any pass needs: one buffer serves them all.
+  static int64_t most_spilled(const std::vector<std::vector<Slot>>& passes) {
+    int64_t most = 0;
+    for (const std::vector<Slot>& slots : passes) {
+      int64_t spilled = 0;
+      for (const Slot& slot : slots) spilled += slot.spilled();
+      most = std::max(most, spilled);
+    }
+    return most;
+  }
+
   // Gives each slot the place of every input row that it scatters to.
   void lay_out_spill(const Pass& pass, std::vector<Slot>& slots) {
     if (!grad_input_.needed()) return;
     int64_t spilled = 0;
     for (const Slot& slot : slots) spilled += slot.spilled();
     const int64_t elements = grad_input_.row_elements();
-    spill_ = spilled > 0 ? Buffer<T>(spilled * elements) : Buffer<T>();
-    if (spill_) std::fill_n(spill_.get(), spilled * elements, T(0));
+    std::fill_n(spill_.get(), spilled * elements, T(0));
     T* next = spill_.get();
     for (Slot& slot : slots) {
       const int64_t n = pass.first_image + slot.first_image;
@@ -100,7 +111,7 @@ class Backward {
   }
 
   void add_spill(const Pass& pass, const std::vector<Slot>& slots) {
-    if (!grad_input_.needed() || !spill_) return;
+    if (!grad_input_.needed()) return;
     const int64_t elements = grad_input_.row_elements(), rows = pass.in.count();
     run_tasks(executor_, rows, workers_for(executor_, rows, rows * elements), [&](int, int64_t i) {
       const int64_t y = pass.in.begin + i;

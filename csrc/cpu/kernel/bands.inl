@@ -11,7 +11,7 @@ struct Slot {
 };
 
 // More than one band an image only where there are too few images for `wanted` tasks, and only
-// while the spill rows stay within as many rows as the pass has.
+// while the spill rows are at most half as many as the pass has.
 template <class T>
 std::vector<Slot> make_slots(const Conv& conv, const View& scale, const Pass& pass, int64_t wanted,
                              bool scatters) {
@@ -49,6 +49,6 @@ std::vector<Slot> make_slots(const Conv& conv, const View& scale, const Pass& pa
         slots.push_back(std::move(slot));
       }
     }
-    if (bands == 1 || !scatters || spill <= pass.images * pass.in.count()) return slots;
+    if (bands == 1 || !scatters || 2 * spill <= pass.images * pass.in.count()) return slots;
   }
 }
