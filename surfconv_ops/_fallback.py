@@ -9,6 +9,7 @@ from torch import Tensor
 
 from . import reference
 from ._loader import missing_library_reason
+from .checks import valid_depth
 from .geometry import Pair
 from .layout import lay_out, memory_format_of
 
@@ -121,7 +122,7 @@ def _backward(
 def level_values(depth: Tensor, edges: Tensor, values: Tensor) -> Tensor:
     """``values[level]`` of every depth; the last value stands where a depth is invalid."""
     level = torch.bucketize(depth, edges)
-    return values[torch.where((depth > 0) & depth.isfinite(), level, -1)]
+    return values[torch.where(valid_depth(depth), level, -1)]
 
 
 def register(library: torch.library.Library) -> None:

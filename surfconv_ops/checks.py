@@ -130,3 +130,8 @@ def check_shareable_conv2d(conv: Any, surf_conv2d: type[nn.Conv2d]) -> None:
             "conv: expected a weight that is a Parameter, got one that is computed (as by"
             " weight_norm), which cannot be shared"
         )
+
+
+def valid_depth(depth: Tensor) -> Tensor:
+    """Where a depth is positive and finite."""
+    return (depth > 0) & (depth < math.inf)

@@ -18,9 +18,10 @@ from .checks import (
     check_finite,
     check_not_negative,
     check_positive_pair,
+    valid_depth,
 )
 from .geometry import FloatPair
-from .levels import DepthLevels, valid_depth
+from .levels import DepthLevels
 from .validation import Window, check_window
 
 #: Share of clamped valid pixels beyond which clamping is probably a mistake in units.
@@ -118,7 +119,7 @@ def _of_depth(reference: float, metres: Tensor, limits: ScaleLimits) -> Tensor:
 
 
 def _of_levels(reference: float, levels: DepthLevels, depth: Tensor, limits: ScaleLimits) -> Tensor:
-    """One scale per level; level -1 indexes the last entry, so the invalid scale stands there."""
+    """One scale per level, computed once for each and looked up by every pixel."""
     scales = [min(max(reference / c, limits.low), limits.high) for c in levels.centers]
     return levels.look_up(depth, scales, limits.invalid)
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .checks import check_depth_tensor, check_not_negative, type_name
+from .checks import check_depth_tensor, check_not_negative, type_name, valid_depth
 from .depth import (
     check_levels,
     check_reference_depth,
@@ -18,7 +18,7 @@ from .depth import (
     read_at_centers,
 )
 from .geometry import FloatPair
-from .levels import DepthLevels, valid_depth
+from .levels import DepthLevels
 from .validation import Window
 
 
@@ -105,8 +105,7 @@ class DepthLayer(nn.Module):
     def _guide(self, depth: Tensor) -> tuple[Tensor | None, float]:
         """What a tap may see, NaN where the depth is invalid, and the guide's tolerance."""
         if self.levels is not None and self.same_level_only:
-            level = self.levels.look_up(depth, range(len(self.levels)), math.nan)
-            return level.to(torch.float32), 0.0
+            return self.levels.look_up(depth, range(len(self.levels)), math.nan), 0.0
         if self.depth_window is not None:
             depth = depth.detach()
             return torch.where(valid_depth(depth), depth, math.nan), self.depth_window

@@ -188,11 +188,6 @@ class DepthLevels:
             raise ValueError(f"path: {os.fspath(path)} holds no valid levels: {error}") from error
 
 
-def valid_depth(depth: Tensor) -> Tensor:
-    """Where a depth is positive and finite."""
-    return (depth > 0) & (depth < math.inf)
-
-
 def _round_down(edges: tuple[float, ...]) -> tuple[float, ...]:
     """float32 edges that part float32 depths just as the exact ones do."""
     with np.errstate(over="ignore"):

@@ -6,14 +6,13 @@ import time
 
 import torch
 
-import cases
 import targets
 from candidates import BASELINE, CONTINUOUS, make_candidate, scene_of
-from cases import DIRECTIONS, Layer
+from cases import Layer
 from frames import make_scene, smooth_kinds
 from plan import Limits, Plan
 from rows import Key, Row, make_row
-from suites.job import Job, Suite, work_of
+from suites.job import Job, Suite, jobs_of_extremes
 from timing import interleave, thread_count
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
@@ -21,18 +20,8 @@ LAYOUT = "contiguous"
 
 
 def jobs(plan: Plan) -> list[Job]:
-    """Shapes A and D."""
-
-    def job(layer: Layer, direction: str) -> Job:
-        return Job(
-            f"{layer.name} {direction}",
-            work_of(layer.macs, direction, 2 * len(DTYPES)),
-            lambda limits: _measure(layer, direction, plan.threads[0], limits),
-        )
-
-    chosen = ("A",) if plan.quick else ("A", "D")
-    layers = [cases.MAIN[name].shrunk(plan.shrink) for name in chosen]
-    return [job(layer, direction) for layer in layers for direction in DIRECTIONS]
+    """Shapes A and D, or A alone."""
+    return jobs_of_extremes(plan, 2 * len(DTYPES), _measure)
 
 
 def _measure(layer: Layer, direction: str, threads: int, limits: Limits) -> list[Row]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import cases
+from cases import DIRECTIONS, Layer
 from plan import Limits, Plan
 from rows import Row
 
@@ -50,3 +52,20 @@ def work_of(macs: int, direction: str, calls: int, threads: int = 1) -> float:
     """Estimated work of a round: multiplications, with a floor for what every call costs."""
     factor = 1.0 if direction == "forward" else BACKWARD_WORK
     return (macs / 1e6 + 10.0) * factor * calls / min(threads, 2)
+
+
+def jobs_of_extremes(
+    plan: Plan, calls: int, measure: Callable[[Layer, str, int, Limits], list[Row]]
+) -> list[Job]:
+    """Both directions of the layers with many channels (A) and with few (D), or of A alone."""
+
+    def job(layer: Layer, direction: str) -> Job:
+        return Job(
+            f"{layer.name} {direction}",
+            work_of(layer.macs, direction, calls),
+            lambda limits: measure(layer, direction, plan.threads[0], limits),
+        )
+
+    chosen = ("A",) if plan.quick else ("A", "D")
+    layers = [cases.MAIN[name].shrunk(plan.shrink) for name in chosen]
+    return [job(layer, direction) for layer in layers for direction in DIRECTIONS]

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 from torch import nn
 
-import cases
 import peers
 import targets
 from candidates import (
@@ -20,12 +19,12 @@ from candidates import (
     make_input,
     scene_of,
 )
-from cases import DIRECTIONS, LAYOUTS, Layer
+from cases import LAYOUTS, Layer
 from frames import Scene, make_scene, smooth_kinds
 from plan import Limits, Plan
 from pyramid import Pyramid
 from rows import Key, Row, make_row
-from suites.job import Job, Suite, work_of
+from suites.job import Job, Suite, jobs_of_extremes
 from timing import interleave, thread_count
 
 LAYOUT = "contiguous"
@@ -63,17 +62,7 @@ def make_peer(name: str, layer: Layer, scene: Scene) -> Candidate:
 
 def jobs(plan: Plan) -> list[Job]:
     """Shapes A and D, or A alone."""
-
-    def job(layer: Layer, direction: str) -> Job:
-        return Job(
-            f"{layer.name} {direction}",
-            work_of(layer.macs, direction, WORK),
-            lambda limits: _measure(layer, direction, plan.threads[0], limits),
-        )
-
-    chosen = ("A",) if plan.quick else ("A", "D")
-    layers = [cases.MAIN[name].shrunk(plan.shrink) for name in chosen]
-    return [job(layer, direction) for layer in layers for direction in DIRECTIONS]
+    return jobs_of_extremes(plan, WORK, _measure)
 
 
 def _measure(layer: Layer, direction: str, threads: int, limits: Limits) -> list[Row]:

@@ -91,6 +91,25 @@ inline std::vector<ChannelBlock> channel_blocks(const Plan& plan, int64_t most) 
   return blocks;
 }
 
+// Blocks that are one task of the backward: nobody else writes their part of a gradient.
+struct Unit {
+  std::vector<ChannelBlock> blocks;
+};
+
+inline std::vector<Unit> make_units(const std::vector<ChannelBlock>& blocks, int64_t channels) {
+  std::vector<Unit> units;
+  int64_t filled = channels;
+  for (const ChannelBlock& block : blocks) {
+    if (filled >= channels) {
+      units.emplace_back();
+      filled = 0;
+    }
+    units.back().blocks.push_back(block);
+    filled += block.padded;
+  }
+  return units;
+}
+
 // Taps gathered at a time, so that the gathered matrix of a tile stays in the second-level cache:
 // whole rows of the kernel, unless a row is longer than anybody's kernel.
 SURFCONV_INLINE int64_t taps_at_once(const Conv& conv, int64_t channels) {

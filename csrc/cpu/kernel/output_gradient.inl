@@ -1,22 +1,3 @@
-// A task's channels of one pass: nobody else writes their part of a gradient.
-struct Unit {
-  std::vector<ChannelBlock> blocks;
-};
-
-inline std::vector<Unit> make_units(const std::vector<ChannelBlock>& blocks, int64_t channels) {
-  std::vector<Unit> units;
-  int64_t filled = channels;
-  for (const ChannelBlock& block : blocks) {
-    if (filled >= channels) {
-      units.emplace_back();
-      filled = 0;
-    }
-    units.back().blocks.push_back(block);
-    filled += block.padded;
-  }
-  return units;
-}
-
 // The gradient of the output as the backward pass of a unit meets it, tile by tile.
 template <class T>
 class OutputGradient {
