@@ -80,7 +80,7 @@ def _prices(rows: Sequence[Row], title: str) -> Any:
     if len(cases) > MOST_CASES_ABREAST:
         lines = [[(direction, layout) for layout in LAYOUTS] for direction in DIRECTIONS]
     grid = [[(count, *cell) for cell in line] for count in threads for line in lines]
-    width = max(INCHES_A_PANEL, 0.64 * len(cases) + 0.6)
+    width = max(INCHES_A_PANEL, 0.82 * len(cases) + 0.6)
     figure, panels = pyplot.subplots(
         len(grid),
         len(grid[0]),
