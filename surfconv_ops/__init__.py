@@ -4,12 +4,14 @@ from . import reference
 from .depth import at_output_centers, depth_to_scale
 from .functional import surf_conv2d
 from .levels import DepthLevels
+from .metrics import SegmentationMetrics
 from .modules import SurfConv2d
 
 __version__ = "0.1.0"
 
 __all__ = [
     "DepthLevels",
+    "SegmentationMetrics",
     "SurfConv2d",
     "__version__",
     "at_output_centers",
