@@ -1,8 +1,10 @@
 """SurfConv: 2D convolution whose footprint follows the depth of the surface it looks at."""
 
 from . import reference
+from .conversion import convert_conv2d
 from .depth import at_output_centers, depth_to_scale
 from .functional import surf_conv2d
+from .guided import DepthGuided
 from .levels import DepthLevels
 from .metrics import SegmentationMetrics
 from .modules import SurfConv2d
@@ -10,11 +12,13 @@ from .modules import SurfConv2d
 __version__ = "0.1.0"
 
 __all__ = [
+    "DepthGuided",
     "DepthLevels",
     "SegmentationMetrics",
     "SurfConv2d",
     "__version__",
     "at_output_centers",
+    "convert_conv2d",
     "depth_to_scale",
     "reference",
     "surf_conv2d",

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from .ambient import depth_of_call, note_layer
 from .checks import check_depth_tensor, check_not_negative, type_name, valid_depth
 from .depth import (
     check_levels,
@@ -80,11 +81,9 @@ class DepthLayer(nn.Module):
 
     def _resolve_depth(self, input: Tensor, depth: Tensor | None) -> Tensor:
         """The depth this call works with: ``(N, H, W)`` or ``(H, W)``, in its compute dtype."""
+        note_layer(self)
         if depth is None:
-            raise ValueError(
-                f"depth: {type(self).__name__} needs the depth of its input, got None; call"
-                " layer(input, depth) with metres at the input's resolution"
-            )
+            depth = depth_of_call(self, input)
         return _match_depth(depth, input)
 
     def _scale(self, depth: Tensor, window: Window) -> Tensor:
