@@ -2,6 +2,7 @@
 
 from . import reference
 from .conversion import convert_conv2d
+from .d4 import D4, fit_depth_levels
 from .depth import at_output_centers, depth_to_scale
 from .functional import surf_conv2d
 from .guided import DepthGuided
@@ -12,6 +13,7 @@ from .modules import SurfConv2d
 __version__ = "0.1.0"
 
 __all__ = [
+    "D4",
     "DepthGuided",
     "DepthLevels",
     "SegmentationMetrics",
@@ -20,6 +22,7 @@ __all__ = [
     "at_output_centers",
     "convert_conv2d",
     "depth_to_scale",
+    "fit_depth_levels",
     "reference",
     "surf_conv2d",
 ]

@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from .geometry import FloatPair, Pair
@@ -18,6 +19,7 @@ from .geometry import FloatPair, Pair
 PairArgument = int | Sequence[int]
 PaddingArgument = int | Sequence[int] | Literal["same", "valid"]
 FloatPairArgument = float | Sequence[float]
+Depths = TypeVar("Depths", Tensor, NDArray[Any])
 
 
 def check_integer(value: Any, name: str, minimum: int) -> int:
@@ -132,6 +134,6 @@ def check_shareable_conv2d(conv: Any, surf_conv2d: type[nn.Conv2d]) -> None:
         )
 
 
-def valid_depth(depth: Tensor) -> Tensor:
+def valid_depth(depth: Depths) -> Depths:
     """Where a depth is positive and finite."""
     return (depth > 0) & (depth < math.inf)

@@ -12,17 +12,16 @@ import argparse
 import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from classes import CLASS_NAMES, PALETTE
-from pictures import page
 from torch import Tensor
 from tqdm import tqdm
 
+from classes import KITTI_CLASSES, palette
 from evaluation import evaluate, report, without_nan
 from folder import FolderError, Frame, FrameFolder
 from paper_net import CLASSES, on_device
+from pictures import FramePictures, page
 from segmenter import CheckpointError, read_checkpoint, restore
 
 
@@ -51,7 +50,7 @@ def run(args: argparse.Namespace) -> None:
     names = folder.names if args.names is None else _chosen(folder, args.names)
     places = np.linspace(0, len(names) - 1, min(max(args.pictures, 0), len(names)))
     shown = {names[int(place)] for place in places.round()}
-    rows: list[tuple[Any, ...]] = []
+    rows: list[FramePictures] = []
 
     def keep(frame: Frame, prediction: Tensor) -> None:
         if frame.name in shown:
@@ -65,7 +64,7 @@ def run(args: argparse.Namespace) -> None:
         f"{args.checkpoint}: {settings.mode}, epoch {content['epoch']} of {settings.epochs}, on"
         f" {len(names)} frames of {args.data}\n"
     )
-    print(report(metrics, CLASS_NAMES))
+    print(report(metrics, KITTI_CLASSES))
     out = args.out or args.checkpoint.parent
     out.mkdir(parents=True, exist_ok=True)
     written = {
@@ -78,7 +77,7 @@ def run(args: argparse.Namespace) -> None:
         json.dumps(without_nan(written), indent=2) + "\n", encoding="utf-8"
     )
     if rows:
-        page(rows, CLASS_NAMES, PALETTE, out / "pictures.png")
+        page(rows, KITTI_CLASSES, palette(CLASSES), out / "pictures.png")
     print(f"\nwrote {out / 'metrics.json'}" + (f" and {out / 'pictures.png'}" if rows else ""))
 
 

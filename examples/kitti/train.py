@@ -102,8 +102,8 @@ class Training:
         config = {
             **self.settings.as_dict(),
             "parameters": parameter_count(self.model),
-            "frames": len(self.names),
-            "validation_frames": len(self.validation_names),
+            "train_frames": len(self.names),
+            "val_frames": len(self.validation_names),
             "device": str(self.device),
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
