@@ -6,6 +6,7 @@ from .functional import surf_conv2d
 from .levels import DepthLevels
 from .metrics import SegmentationMetrics
 from .modules import SurfConv2d
+from .pyramid import SurfConvPyramid
 
 __version__ = "0.1.0"
 
@@ -13,6 +14,7 @@ __all__ = [
     "DepthLevels",
     "SegmentationMetrics",
     "SurfConv2d",
+    "SurfConvPyramid",
     "__version__",
     "at_output_centers",
     "depth_to_scale",
