@@ -196,7 +196,7 @@ class SegmentationMetrics:
         ignored = "" if self.ignore_index is None else f" or ignore_index = {self.ignore_index}"
         raise ValueError(
             f"{name}: expected class ids in 0 .. {self.num_classes - 1}{ignored}, got"
-            f" {int(ids[refused][0])}; {int(refused.sum())} of {ids.numel()} ids are out of range"
+            f" {int(ids[refused][0])}"
         )
 
     def merge(self, other: SegmentationMetrics) -> None:
