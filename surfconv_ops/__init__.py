@@ -9,6 +9,7 @@ from .guided import DepthGuided
 from .levels import DepthLevels
 from .metrics import SegmentationMetrics
 from .modules import SurfConv2d
+from .pyramid import SurfConvPyramid
 
 __version__ = "0.1.0"
 
@@ -18,6 +19,7 @@ __all__ = [
     "DepthLevels",
     "SegmentationMetrics",
     "SurfConv2d",
+    "SurfConvPyramid",
     "__version__",
     "at_output_centers",
     "convert_conv2d",

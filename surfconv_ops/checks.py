@@ -6,6 +6,7 @@ raise TypeError.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from numbers import Real
@@ -106,6 +107,35 @@ def check_depth_tensor(depth: Any, name: str = "depth") -> Tensor:
             f" integer millimetres: convert with {name}.float() / 1000 (or by your sensor's unit)"
         )
     return depth
+
+
+def check_class_ids(ids: Any, name: str) -> Tensor:
+    """A tensor of integers."""
+    if not isinstance(ids, Tensor):
+        raise TypeError(f"{name}: expected a tensor of class ids, got {type_name(ids)}")
+    if ids.is_floating_point() or ids.is_complex():
+        raise TypeError(
+            f"{name}: expected integer class ids, got {ids.dtype} of shape {tuple(ids.shape)}; of"
+            " scores (N, C, H, W), pass scores.argmax(1)"
+        )
+    return ids
+
+
+def check_depth_ranges(depth_ranges: Any) -> tuple[float, ...] | None:
+    """Ascending boundaries of depth ranges in metres, or None."""
+    if depth_ranges is None:
+        return None
+    if isinstance(depth_ranges, str) or not isinstance(depth_ranges, Sequence):
+        raise TypeError(f"depth_ranges: expected a sequence of metres, got {depth_ranges!r}")
+    edges = tuple(check_not_negative(v, f"depth_ranges[{i}]") for i, v in enumerate(depth_ranges))
+    if len(edges) < 2:
+        raise ValueError(f"depth_ranges: expected at least two boundaries, got {list(edges)}")
+    for low, high in itertools.pairwise(edges):
+        if high <= low:
+            raise ValueError(
+                f"depth_ranges: expected strictly ascending metres, got {high} after {low}"
+            )
+    return edges
 
 
 def type_name(value: Any) -> str:

@@ -11,7 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import check_depth_tensor, check_integer, check_not_negative, type_name, valid_depth
+from .checks import (
+    check_class_ids,
+    check_depth_ranges,
+    check_depth_tensor,
+    check_integer,
+    type_name,
+    valid_depth,
+)
 
 #: Boundaries of the depth ranges that figures are also given for, in metres.
 DEPTH_RANGES = (0.0, 5.0, 10.0, 20.0, 40.0, math.inf)
@@ -78,7 +85,7 @@ class SegmentationMetrics:
                 f" {type_name(ignore_index)}"
             )
         self.ignore_index = ignore_index
-        self.depth_ranges = _check_ranges(depth_ranges)
+        self.depth_ranges = check_depth_ranges(depth_ranges)
         self.reset()
 
     def reset(self) -> None:
@@ -123,8 +130,8 @@ class SegmentationMetrics:
             ValueError: An id is out of range, or shapes or devices differ.
             TypeError: ``prediction`` or ``target`` is not of integers, or ``depth`` not of floats.
         """
-        prediction = _check_integers(prediction, "prediction")
-        target = _check_integers(target, "target")
+        prediction = check_class_ids(_to_tensor(prediction), "prediction")
+        target = check_class_ids(_to_tensor(target), "target")
         depth = check_depth_tensor(_to_tensor(depth)).detach()
         if target.ndim not in (2, 3):
             raise ValueError(f"target: expected (N, H, W) or (H, W), got {tuple(target.shape)}")
@@ -189,7 +196,7 @@ class SegmentationMetrics:
         ignored = "" if self.ignore_index is None else f" or ignore_index = {self.ignore_index}"
         raise ValueError(
             f"{name}: expected class ids in 0 .. {self.num_classes - 1}{ignored}, got"
-            f" {int(ids[refused][0])}; {int(refused.sum())} of {ids.numel()} ids are out of range"
+            f" {int(ids[refused][0])}"
         )
 
     def merge(self, other: SegmentationMetrics) -> None:
@@ -310,31 +317,3 @@ def _counts_well(device: torch.device) -> bool:
 
 def _to_tensor(map: Any) -> Any:
     return torch.from_numpy(map) if isinstance(map, np.ndarray) else map
-
-
-def _check_integers(ids: Any, name: str) -> Tensor:
-    ids = _to_tensor(ids)
-    if not isinstance(ids, Tensor):
-        raise TypeError(f"{name}: expected a tensor of class ids, got {type_name(ids)}")
-    if ids.is_floating_point() or ids.is_complex():
-        raise TypeError(
-            f"{name}: expected integer class ids, got {ids.dtype} of shape {tuple(ids.shape)}; of"
-            " scores (N, C, H, W), pass scores.argmax(1)"
-        )
-    return ids
-
-
-def _check_ranges(depth_ranges: Any) -> tuple[float, ...] | None:
-    if depth_ranges is None:
-        return None
-    if isinstance(depth_ranges, str) or not isinstance(depth_ranges, Sequence):
-        raise TypeError(f"depth_ranges: expected a sequence of metres, got {depth_ranges!r}")
-    edges = tuple(check_not_negative(v, f"depth_ranges[{i}]") for i, v in enumerate(depth_ranges))
-    if len(edges) < 2:
-        raise ValueError(f"depth_ranges: expected at least two boundaries, got {list(edges)}")
-    for low, high in itertools.pairwise(edges):
-        if high <= low:
-            raise ValueError(
-                f"depth_ranges: expected strictly ascending metres, got {high} after {low}"
-            )
-    return edges

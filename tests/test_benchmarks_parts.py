@@ -20,8 +20,7 @@ import gate
 import net
 import peers
 import points
-from pyramid import Pyramid
-from surfconv_ops import DepthLevels, SurfConv2d
+from surfconv_ops import SurfConv2d
 from voxels import voxelise
 
 
@@ -74,21 +73,6 @@ def assert_peer_agrees(peer: type[peers.DepthConv2d], shape: cases.Layer) -> Non
     pairs = zip(theirs.backward()(), ours.backward()(), strict=True)
     for name, (got, want) in zip(("input", "weight", "bias"), pairs, strict=False):
         assert gate.relative_rms(got, want) < 1e-3, name
-
-
-@pytest.mark.parametrize(("center", "step"), [(4.0, 1), (2.0, 2), (8.0, 1)])
-def test_the_pyramid_is_levels_mode_where_both_grids_meet(center: float, step: int) -> None:
-    levels = DepthLevels([], [center])
-    conv = nn.Conv2d(3, 5, 3, padding=1)
-    surf = SurfConv2d.from_conv2d(conv, reference_depth=4.0, levels=levels)
-    image, depth = torch.randn(2, 3, 21, 25), torch.full((2, 21, 25), center)
-    depth[:, :, :3] = 0.0
-    both = [layer(image, depth)[..., 2:-2:step, 4:-2:step] for layer in (
-        Pyramid(conv, levels, 4.0), surf)]  # fmt: skip
-    torch.testing.assert_close(both[0], both[1], rtol=1e-4, atol=1e-5)
-    # Pixels without depth are a level of their own, the plain convolution.
-    missing = Pyramid(conv, levels, 4.0)(image, depth)[..., :3]
-    torch.testing.assert_close(missing, conv(image)[..., :3], rtol=1e-4, atol=1e-5)
 
 
 def test_the_gates_relation_is_conv2d_at_scale_one_and_nothing_else() -> None:

@@ -15,9 +15,9 @@ from frames import Scene, make_scene, smooth_kinds
 from net import PARAMETERS, PaperNet, surf_factory
 from peers import PYRAMID
 from plan import Limits, Plan
-from pyramid import Pyramid
 from rows import Key, Row, make_row
 from suites.job import Job, Suite, work_of
+from surfconv_ops import SurfConvPyramid
 from timing import interleave, thread_count
 
 FORWARD, STEP = "forward", "forward + backward"
@@ -56,7 +56,7 @@ def make_nets(scene: Scene) -> dict[str, nn.Module]:
         BASELINE: plain,
         LEVELS: surf(LEVELS),
         CONTINUOUS: surf(CONTINUOUS),
-        PYRAMID: Pyramid(plain, scene.levels, scene.reference_depth),
+        PYRAMID: SurfConvPyramid(plain, scene.levels, scene.reference_depth),
     }
 
 

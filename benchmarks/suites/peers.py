@@ -22,9 +22,9 @@ from candidates import (
 from cases import LAYOUTS, Layer
 from frames import Scene, make_scene, smooth_kinds
 from plan import Limits, Plan
-from pyramid import Pyramid
 from rows import Key, Row, make_row
 from suites.job import Job, Suite, jobs_of_extremes
+from surfconv_ops import SurfConvPyramid
 from timing import interleave, thread_count
 
 LAYOUT = "contiguous"
@@ -45,7 +45,7 @@ def make_peer(name: str, layer: Layer, scene: Scene) -> Candidate:
     """One of `COUNTERPARTS` with the weights and inputs that SurfConv2d has."""
 
     def pyramid() -> nn.Module:
-        return Pyramid(make_conv(layer), scene.levels, scene.reference_depth)
+        return SurfConvPyramid(make_conv(layer), scene.levels, scene.reference_depth)
 
     def of(kind: type[peers.DepthConv2d]) -> Callable[[], nn.Module]:
         return lambda: make_conv(layer, kind, reference_depth=scene.reference_depth)
@@ -100,7 +100,7 @@ def _measure(layer: Layer, direction: str, threads: int, limits: Limits) -> list
 
 def _frames(module: nn.Module) -> str:
     """How much the pyramid has to look at, which its cost follows."""
-    if not isinstance(module, Pyramid):
+    if not isinstance(module, SurfConvPyramid):
         return ""
     pixels = sum(scale**-2 for scale in module.scales)
     return f"its {len(module.scales)} frames have {pixels:.1f} times the pixels of the original"
