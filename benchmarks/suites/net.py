@@ -12,7 +12,7 @@ import cases
 import targets
 from candidates import BASELINE, CONTINUOUS, LEVELS, random_like, surf_options
 from frames import Scene, make_scene, smooth_kinds
-from net import PARAMETERS, PaperNet, surf_factory
+from net import PARAMETERS, GuidedPaperNet, PaperNet
 from peers import PYRAMID
 from plan import Limits, Plan
 from rows import Key, Row, make_row
@@ -48,7 +48,7 @@ def make_nets(scene: Scene) -> dict[str, nn.Module]:
 
     def surf(mode: str) -> nn.Module:
         torch.manual_seed(1)
-        return PaperNet(surf_factory(**surf_options(mode, scene)))
+        return GuidedPaperNet(**surf_options(mode, scene))
 
     torch.manual_seed(1)
     plain = PaperNet()
