@@ -26,16 +26,16 @@ from voxels import voxelise
 
 def test_the_converted_net_is_the_papers_at_reference_depth() -> None:
     torch.manual_seed(0)
-    plain = net.PaperNet().eval()
+    plain = net.PaperNet().double().eval()
     torch.manual_seed(0)
-    surf = net.GuidedPaperNet(reference_depth=4.0).eval()
+    surf = net.GuidedPaperNet(reference_depth=4.0).double().eval()
     for module in surf.modules():
         if isinstance(module, nn.Conv2d):
             assert isinstance(module, SurfConv2d) == (module.kernel_size != (1, 1))
-    image = torch.randn(1, 6, 48, 64)
+    image = torch.randn(1, 6, 48, 64, dtype=torch.float64)
     expected = plain(image)
     at_reference = surf(image, torch.full((1, 48, 64), 4.0))
-    torch.testing.assert_close(at_reference, expected, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(at_reference, expected, rtol=1e-10, atol=1e-10)
     elsewhere = surf(image, torch.full((1, 48, 64), 2.0))
     assert (elsewhere - expected).abs().max() > 1e-3
 

@@ -63,13 +63,13 @@ def test_every_mode_has_the_same_parameters_and_at_reference_depth_the_same_scor
 ) -> None:
     torch.manual_seed(3)
     settings = Settings(mode, reference_depth=15.0, pools=True)
-    model = Segmenter(settings, LEVELS).eval()
+    model = Segmenter(settings, LEVELS).double().eval()
     torch.manual_seed(3)
-    plain = PaperNet().eval()
+    plain = PaperNet().double().eval()
     assert list(model.net.state_dict()) == list(plain.state_dict())
-    input = torch.randn(2, 6, *SIZE)
+    input = torch.randn(2, 6, *SIZE, dtype=torch.float64)
     depth = torch.full((2, *SIZE), 15.0)
-    torch.testing.assert_close(model(input, depth), plain(input), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(model(input, depth), plain(input), rtol=1e-10, atol=1e-10)
     changed = not torch.allclose(model(input, depth / 3), plain(input), rtol=1e-2, atol=1e-2)
     assert changed == (mode != "conv2d")
 
