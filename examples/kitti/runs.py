@@ -18,7 +18,7 @@ MODES = ("conv2d", "pyramid", "levels", "continuous")
 RUN_KEYS = frozenset(
     {
         "seed", "out", "data", "device", "threads", "workers", "resume", "parameters", "command",
-        "commit", "started", "version", "versions", "torch", "host", "train_frames", "val_frames",
+        "commit", "started", "version", "versions", "torch", "host", "frames", "validation_frames",
     }
 )  # fmt: skip
 
@@ -72,7 +72,7 @@ class Run:
     def value(self, metric: str, at: str) -> float | None:
         """The metric at 'best' or 'last' epoch; None where the run does not hold it."""
         record = self.best if at == "best" else self.last
-        found = (record or {}).get("val", {}).get(metric)
+        found = ((record or {}).get("val") or {}).get(metric)
         return None if found is None or math.isnan(found) else float(found)
 
 
