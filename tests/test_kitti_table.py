@@ -197,3 +197,14 @@ def test_damaged_folders_are_refused(
 def test_a_missing_folder_is_named(tmp_path: Path, capsys: Any) -> None:
     assert table.main([str(tmp_path / "nowhere")]) == 2
     assert "nowhere: no such folder" in capsys.readouterr().err
+
+
+def test_runs_without_validation_show_no_figures(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a", 0.2)
+    nothing = json.dumps({"epoch": 4, "val": None})
+    for name in ("best.json", "last.json"):
+        (folder / name).write_text(nothing)
+    run = runs.load_run(folder)
+    assert run.finished and run.value("iou_surf", "best") is None
+    row = cells(table.markdown(runs.group_runs([run]), "best"), "conv2d")
+    assert row["IOU_surf"] == "–" and row["seeds"] == "1 (0)"
