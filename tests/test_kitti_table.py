@@ -94,6 +94,24 @@ def test_without_a_fair_baseline_there_is_no_gain(tmp_path: Path) -> None:
     assert cells(table.markdown(groups, "best"), "pyramid")["IOU_surf over conv2d"] == "–"
 
 
+def test_the_baseline_is_trained_in_the_same_way(tmp_path: Path) -> None:
+    folders = [
+        write_run(tmp_path / "slow", 0.1, rate=0.01, pools=False),
+        write_run(tmp_path / "fast", 0.2, rate=0.05, pools=False),
+        write_run(tmp_path / "p", 0.3, mode="pyramid", levels=4, rate=0.05, pools=True),
+    ]
+    groups = runs.group_runs([runs.load_run(folder) for folder in folders])
+    assert cells(table.markdown(groups, "last"), "pyramid")["IOU_surf over conv2d"] == "+10.00"
+
+
+def test_settings_of_different_versions_are_told_apart(tmp_path: Path) -> None:
+    folders = [write_run(tmp_path / "old", 0.1), write_run(tmp_path / "new", 0.1, augment="none")]
+    groups = runs.group_runs([runs.load_run(folder) for folder in folders])
+    labels = [runs.label_of(group, groups) for group in groups]
+    assert labels == ["conv2d", "conv2d, augment none"]
+    assert "augment=none" in table.markdown(groups, "last")
+
+
 def test_a_baseline_of_the_same_loss_goes_first(tmp_path: Path) -> None:
     folders = [
         write_run(tmp_path / "image", 0.2),
@@ -197,3 +215,14 @@ def test_damaged_folders_are_refused(
 def test_a_missing_folder_is_named(tmp_path: Path, capsys: Any) -> None:
     assert table.main([str(tmp_path / "nowhere")]) == 2
     assert "nowhere: no such folder" in capsys.readouterr().err
+
+
+def test_runs_without_validation_show_no_figures(tmp_path: Path) -> None:
+    folder = write_run(tmp_path / "a", 0.2)
+    nothing = json.dumps({"epoch": 4, "val": None})
+    for name in ("best.json", "last.json"):
+        (folder / name).write_text(nothing)
+    run = runs.load_run(folder)
+    assert run.finished and run.value("iou_surf", "best") is None
+    row = cells(table.markdown(runs.group_runs([run]), "best"), "conv2d")
+    assert row["IOU_surf"] == "–" and row["seeds"] == "1 (0)"

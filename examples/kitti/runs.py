@@ -13,12 +13,19 @@ from typing import Any
 METRICS = ("acc_img", "iou_img", "acc_surf", "iou_surf")
 #: What sets two settings apart comes first in tables, in this order.
 SETTING_KEYS = ("mode", "levels", "gamma", "capacity", "loss", "reference_depth", "epochs")
+#: What the modes differ in, apart from how they are trained; the loss may have to differ too.
+MODE_KEYS = frozenset(
+    {
+        "mode", "levels", "gamma", "reference_depth", "loss", "invalid_scale", "min_scale",
+        "max_scale", "depth_window", "same_level_only", "pools",
+    }
+)  # fmt: skip
 MODES = ("conv2d", "pyramid", "levels", "continuous")
 #: Facts about a run that are not its setting.
 RUN_KEYS = frozenset(
     {
         "seed", "out", "data", "device", "threads", "workers", "resume", "parameters", "command",
-        "commit", "started", "version", "versions", "torch", "host", "train_frames", "val_frames",
+        "commit", "started", "version", "versions", "torch", "host", "frames", "validation_frames",
     }
 )  # fmt: skip
 
@@ -72,7 +79,7 @@ class Run:
     def value(self, metric: str, at: str) -> float | None:
         """The metric at 'best' or 'last' epoch; None where the run does not hold it."""
         record = self.best if at == "best" else self.last
-        found = (record or {}).get("val", {}).get(metric)
+        found = ((record or {}).get("val") or {}).get(metric)
         return None if found is None or math.isnan(found) else float(found)
 
 
@@ -203,12 +210,16 @@ def _order(mode: Any) -> int:
 
 
 def baseline_of(group: Group, groups: Sequence[Group]) -> Group | None:
-    """The single-level conv2d setting to compare with: same capacity, epochs and, if any, loss."""
+    """The conv2d setting to compare with: alike in training, and in the loss where there is one."""
     same = [
         other
         for other in groups
         if other.setting.get("mode") == "conv2d"
-        and all(other.setting.get(k) == group.setting.get(k) for k in ("capacity", "epochs"))
+        and all(
+            other.setting[key] == value
+            for key, value in group.setting.items()
+            if key in other.setting and key not in MODE_KEYS
+        )
     ]
     alike = [other for other in same if other.setting.get("loss") == group.setting.get("loss")]
     chosen = alike or same
@@ -225,13 +236,19 @@ def label_of(group: Group, groups: Sequence[Group]) -> str:
 
 
 def varying_keys(groups: Sequence[Group]) -> list[str]:
-    """Keys on which the settings that have them disagree, the usual ones first."""
+    """Keys on which settings of one mode or of two disagree, the usual ones first."""
     keys = dict.fromkeys((*SETTING_KEYS, *(k for group in groups for k in group.setting)))
-    return [
-        key
-        for key in keys
-        if len({json.dumps(g.setting[key], sort_keys=True) for g in groups if key in g.setting}) > 1
-    ]
+    return [key for key in keys if _varies(key, groups)]
+
+
+def _varies(key: str, groups: Sequence[Group]) -> bool:
+    values: dict[Any, set[str]] = {}
+    for group in groups:
+        shown = json.dumps(group.setting[key], sort_keys=True) if key in group.setting else ""
+        values.setdefault(group.setting.get("mode"), set()).add(shown)
+    # A mode may do without a key; between runs of one mode its absence is a difference.
+    within = any(len(found) > 1 for found in values.values())
+    return within or len(set().union(*values.values()) - {""}) > 1
 
 
 def short(value: Any) -> str:

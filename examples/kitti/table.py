@@ -100,8 +100,8 @@ def markdown(groups: Sequence[Group], at: str) -> str:
         rows.append([*cells, f"{more:+.2f}" if more else NOTHING, NOTHING])
     text = [
         f"Percent at each run's {at} epoch: mean ± standard deviation (least to greatest) over "
-        "seeds. The gain over conv2d is taken seed by seed, at the same capacity and epochs. The "
-        "paper's rows are for its 37 test frames and its best setting on KITTI (Table 2).",
+        "seeds. The gain over conv2d is taken seed by seed, against runs trained in the same "
+        "way. The paper's rows are for its 37 test frames and its best setting on KITTI (Table 2).",
         "",
         *_table(head, rows),
     ]
