@@ -126,6 +126,7 @@ PIVOTS = {"prices": _prices, "distances": _distances}
 def _details(rows: Sequence[Row], per_pixel: bool) -> list[str]:
     """Every number of a table; columns in which nothing differs are left out."""
     unit = rows[0].unit
+    single = all(row.samples == 1 for row in rows)
     every = {
         "case": [row.case for row in rows],
         "what": [row.subject for row in rows],
@@ -134,7 +135,7 @@ def _details(rows: Sequence[Row], per_pixel: bool) -> list[str]:
         "depth": [row.depth for row in rows],
         "dtype": [row.dtype for row in rows],
         "threads": [str(row.threads) for row in rows],
-        f"median {unit}" if max(row.samples for row in rows) > 1 else unit: [_number(row.value) for row in rows],
+        unit if single else f"median {unit}": [_number(row.value) for row in rows],
         "quartiles": [f"{_number(row.low)} .. {_number(row.high)}" for row in rows],
         "calls" if unit == "ms" else "samples": [str(row.samples) for row in rows],
         "ns per pixel": [

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 
-from scene import COLOURS, View, uniform
+from scene import COLOURS, View, cast, uniform
 from surfconv_ops import DepthLevels, SurfConv2d
 
 #: Filters of a layer.
@@ -145,7 +145,8 @@ def match(views: Sequence[View], reach: int, stride: int, reference_depth: float
         seen &= ((at >= border) & (at <= size - 1 - border)).all(1)
         nearest = at.round().long().clamp(0, size - 1)
         place = nearest[:, 1] * size + nearest[:, 0]
-        seen &= view.facet.flatten()[place] == facets
+        seen &= depth > 0
+        seen[seen.clone()] = cast(view.facets, view.camera, at[seen]).facet == facets[seen]
         widest = math.ceil(WIDEST * reference_depth * reach / float(view.depth.min()))
         inside &= uniform(view.facet, max(reach, widest) + 1).flatten()[place]
         positions.append(at)

@@ -53,6 +53,8 @@ class Waves:
     def __call__(self, place: Tensor, sides: Tensor) -> Tensor:
         parts = []
         for at, side in zip(place.split(CHUNK), sides.split(CHUNK), strict=True):
+            # All pixels of a wall that faces the camera have the same footprint.
+            side = side[:1] if bool((side == side[:1]).all()) else side
             # A wave's mean over a side of phase p is sin(p / 2) / (p / 2); torch.sinc holds a pi.
             kept = torch.sinc(side @ self.waves.T / (2 * math.pi)).prod(1)
             phase = at @ self.waves.T
@@ -60,7 +62,7 @@ class Waves:
         return torch.cat(parts, 1)
 
 
-def make_waves(wavelengths: Sequence[float], seed: int, each: int = 16) -> Waves:
+def make_waves(wavelengths: Sequence[float], seed: int, each: int = 12) -> Waves:
     """Waves of random direction and phase, `each` per wavelength, with unit variance a colour.
 
     Args:
@@ -166,12 +168,14 @@ class View:
         image: (3, size, size) float32.
         depth: (size, size) metres, at the centre of each pixel.
         facet: (size, size) number of the facet seen there.
+        facets: the scene.
     """
 
     camera: Camera
     image: Tensor
     depth: Tensor
     facet: Tensor
+    facets: Sequence[Facet]
 
     def points(self) -> Tensor:
         """Points in space (size * size, 3) at the centres of all pixels."""
@@ -229,26 +233,38 @@ def uniform(facet: Tensor, radius: int) -> Tensor:
     return (max_pool2d(numbers, **window) == -max_pool2d(-numbers, **window))[0]
 
 
-def render(facets: Sequence[Facet], texture: Texture, camera: Camera) -> View:
-    """The view of a scene."""
+def render(
+    facets: Sequence[Facet], texture: Texture, camera: Camera, footprint: float = 1.0
+) -> View:
+    """The view of a scene.
+
+    Args:
+        facets: what is looked at.
+        texture: its colours.
+        camera: who looks.
+        footprint: side of what a pixel averages, in pixels.
+
+    Returns:
+        The view.
+    """
     pixels = camera.grid()
     hits = cast(facets, camera, pixels)
-    colours = texture(hits.place, hits.sides)
+    colours = texture(hits.place, footprint * hits.sides)
     facet = hits.facet.reshape(camera.size, camera.size)
     edge = (~uniform(facet, 1)).flatten()
     if bool(edge.any()):
-        colours[:, edge] = _of_many_rays(facets, texture, camera, pixels[edge])
+        colours[:, edge] = _of_many_rays(facets, texture, camera, pixels[edge], footprint)
     shape = (camera.size, camera.size)
     image = colours.reshape(COLOURS, *shape).float()
-    return View(camera, image, hits.depth.reshape(shape).float(), facet)
+    return View(camera, image, hits.depth.reshape(shape).float(), facet, facets)
 
 
 def _of_many_rays(
-    facets: Sequence[Facet], texture: Texture, camera: Camera, pixels: Tensor
+    facets: Sequence[Facet], texture: Texture, camera: Camera, pixels: Tensor, footprint: float
 ) -> Tensor:
     """Colours of pixels cut into EDGE_RAYS x EDGE_RAYS parts, each the mean over its footprint."""
     parts = (torch.arange(EDGE_RAYS, dtype=torch.float64) + 0.5) / EDGE_RAYS - 0.5
     shifts = torch.cartesian_prod(parts, parts)
-    hits = cast(facets, camera, (pixels[:, None] + shifts).reshape(-1, 2))
-    colours = texture(hits.place, hits.sides / EDGE_RAYS)
+    hits = cast(facets, camera, (pixels[:, None] + footprint * shifts).reshape(-1, 2))
+    colours = texture(hits.place, footprint * hits.sides / EDGE_RAYS)
     return colours.reshape(COLOURS, len(pixels), -1).mean(2)

@@ -14,6 +14,7 @@ A slanted surface adds the error of local planarity, and a step in depth adds pa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from statistics import median
@@ -40,6 +41,8 @@ from scene import Camera, Facet, View, box, make_waves, render, slant, wall
 from suites.job import Job, Suite
 from timing import quartiles, thread_count
 
+#: What is left if taps read the surface itself and each view keeps its pixels' blur alone.
+LIMIT = "perfect interpolation"
 EIGHT_LEVELS = "SurfConv2d 8 levels"
 SUBJECTS = (BASELINE, LEVELS, EIGHT_LEVELS, CONTINUOUS)
 LEVEL_COUNTS = {LEVELS: 4, EIGHT_LEVELS: 8}
@@ -48,7 +51,7 @@ LEVEL_COUNTS = {LEVELS: 4, EIGHT_LEVELS: 8}
 DISTANCE = 2.0
 DISTANCES = (1, 2, 4)
 #: Focal length in pixels of a view of SIZE x SIZE; a smaller view has the same field of view.
-SIZE, FOCAL = 192, 200.0
+SIZE, FOCAL = 128, 128.0
 LEAST_SIZE = 64
 MIDDLE = 2 * DISTANCE
 REFERENCES = {"1x": DISTANCE, "2x": MIDDLE, "4x": 4 * DISTANCE}
@@ -58,7 +61,7 @@ SLOPE = 0.75
 SEEDS, QUICK_SEEDS = 4, 2
 
 WALL, SLANT, BOXES = "wall", "slanted wall", "boxes"
-INSIDE, ACROSS = "boxes, inside their faces", "boxes, across steps in depth"
+TEXTURES = {"coarse octaves": OCTAVES[:3], "all octaves": OCTAVES}
 NET = Net("3x3")
 NETS = (
     Net("3x3, zero-sum filters", zero_sum=True),
@@ -80,6 +83,7 @@ class Case:
         wavelengths: of the texture, in tap spacings; one, or `OCTAVES`.
         net: the layers.
         reference: where reference_depth is, a key of `REFERENCES`.
+        across: compares the points next to steps in depth, not those on one facet alone.
     """
 
     table: str
@@ -88,11 +92,12 @@ class Case:
     wavelengths: tuple[float, ...] = OCTAVES
     net: Net = NET
     reference: str = "2x"
+    across: bool = False
 
     @property
     def coarse(self) -> bool:
         """Held against the target: a wall and a texture that pixels and taps resolve."""
-        return self.table == "texture" and min(self.wavelengths) >= targets.COARSE_TAPS
+        return self.scene == WALL and min(self.wavelengths) >= targets.COARSE_TAPS
 
 
 def scene_of(name: str) -> list[Facet]:
@@ -117,13 +122,19 @@ def size_of(plan: Plan) -> int:
     return max(LEAST_SIZE, SIZE // ((2 if plan.quick else 1) * plan.shrink))
 
 
-@lru_cache(maxsize=32)
-def views_of(scene: str, wavelengths: tuple[float, ...], size: int) -> tuple[View, ...]:
-    """A scene from every distance, nearest first."""
+@lru_cache(maxsize=64)
+def view_of(
+    scene: str, wavelengths: tuple[float, ...], size: int, times: int, footprint: float = 1.0
+) -> View:
+    """A scene from `times` the distance."""
     focal = FOCAL * size / SIZE
     texture = make_waves([taps * MIDDLE / focal for taps in wavelengths], seed=1)
-    cameras = [Camera(size, focal, (times - 1) * DISTANCE) for times in DISTANCES]
-    return tuple(render(scene_of(scene), texture, camera) for camera in cameras)
+    return render(scene_of(scene), texture, Camera(size, focal, (times - 1) * DISTANCE), footprint)
+
+
+def views_of(scene: str, wavelengths: tuple[float, ...], size: int) -> list[View]:
+    """A scene from every distance, nearest first."""
+    return [view_of(scene, wavelengths, size, times) for times in DISTANCES]
 
 
 def options_of(subject: str, case: Case, focal: float, shift: float) -> dict[str, Any]:
@@ -140,8 +151,12 @@ def options_of(subject: str, case: Case, focal: float, shift: float) -> dict[str
 
 def cases_of(quick: bool) -> list[Case]:
     """Every line of every table."""
-    scenes = [Case("scenes", WALL), Case("scenes", SLANT, SLANT)]
-    scenes += [Case("scenes", INSIDE, BOXES), Case("scenes", ACROSS, BOXES)]
+    scenes = []
+    for name, octaves in TEXTURES.items():
+        scenes += [Case("scenes", f"{scene}, {name}", scene, octaves) for scene in (WALL, SLANT)]
+        for where, across in (("inside faces", False), ("across steps", True)):
+            text = f"{BOXES} {where}, {name}"
+            scenes.append(Case("scenes", text, BOXES, octaves, across=across))
     waves = OCTAVES[1::2] if quick else OCTAVES[1:]
     textures = [Case("texture", f"wavelength {taps:g} taps", WALL, (taps,)) for taps in waves]
     places = [Case("reference depth", f"at {at}", reference=at) for at in REFERENCES]
@@ -151,7 +166,8 @@ def cases_of(quick: bool) -> list[Case]:
 
 def subjects_of(case: Case) -> tuple[str, ...]:
     """What a case compares."""
-    return (*SUBJECTS, WINDOW) if case.scene == BOXES else SUBJECTS
+    more = {WALL: (LIMIT,), BOXES: (WINDOW,)}
+    return (*SUBJECTS, *more.get(case.scene, ()))
 
 
 def jobs(plan: Plan) -> list[Job]:
@@ -168,25 +184,32 @@ def jobs(plan: Plan) -> list[Job]:
 
 
 def responses(
-    subject: str, case: Case, views: tuple[View, ...], points: Matches, seed: int, seeds: int
+    subject: str, case: Case, views: Sequence[View], points: Matches, seed: int, seeds: int
 ) -> list[torch.Tensor]:
     """Features (FILTERS, points) in every view."""
     convs: Any = case.net.convolutions(seed)
-    if subject != BASELINE:
+    positions = points.positions
+    if subject == LIMIT:
+        # From its reference depth a plain layer's taps are those of continuous mode from anywhere.
+        place = list(REFERENCES).index(case.reference)
+        at, size = DISTANCES[place], views[0].camera.size
+        views = [view_of(case.scene, case.wavelengths, size, at, times / at) for times in DISTANCES]
+        positions = [positions[place]] * len(views)
+    elif subject != BASELINE:
         # Else the figure would depend on how far from a level's middle the distances happen to be.
         shift = (seed + 0.5) / seeds - 0.5
         convs = convert(convs, **options_of(subject, case, views[0].camera.focal, shift))
     return [
         read(features(convs, view), at / case.net.stride)
-        for view, at in zip(views, points.positions, strict=True)
+        for view, at in zip(views, positions, strict=True)
     ]
 
 
-def points_of(case: Case, views: tuple[View, ...]) -> Matches:
+def points_of(case: Case, views: Sequence[View]) -> Matches:
     """The surface points that a case compares."""
     net = case.net
     points = match(views, net.reach, net.stride, REFERENCES[case.reference])
-    chosen = ~points.inside if case.name == ACROSS else points.inside
+    chosen = points.inside != case.across
     return Matches([at[chosen] for at in points.positions], chosen[chosen])
 
 
