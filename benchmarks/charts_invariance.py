@@ -30,7 +30,7 @@ from suites.invariance import (
 )
 
 #: Views are drawn finer than they are measured.
-DRAWN_SIZE = 3 * SIZE // 2
+DRAWN_SIZE = 5 * SIZE // 4
 DRAWN = {"nn.Conv2d": invariance.BASELINE, "4 levels": invariance.LEVELS,
          "continuous": invariance.CONTINUOUS}  # fmt: skip
 FILTER = Net("3x3, zero-sum filters", zero_sum=True)

@@ -279,17 +279,19 @@ def _rows(
 SUITE = Suite(
     "invariance",
     "How features change with distance, before training",
-    "The same textured surfaces from 1, 2 and 4 times the distance (2, 4 and 8 m), features of "
-    "untrained layers with the same random weights at the same surface points, away from the "
-    "views' borders. Change: |f_s(p) - f_1(p)| over the standard deviation of f_1 over the "
-    "surface, norms over 16 filters, median and quartiles over points and seeds: 0 is the same "
-    "feature, about 1.41 one that has nothing to do with it. Correlation: of f_s and f_1 over "
-    "points and filters. Textures are sums of waves, their length in tap spacings of a layer whose "
-    "reference depth is 4 m (2x); where none is named, octaves of 2 to 64 taps in equal parts, of "
-    "which no view at 4x can hold the finest. Levels are equally wide in log depth, a factor of 8 "
-    "in all, shifted from seed to seed. Expected: next to no change in continuous mode where the "
-    "texture is coarse against taps and pixels, some in levels mode (half a level), much in "
-    "nn.Conv2d; and all three fail on texture finer than the distant pixel.",
+    "A camera moves back from 2 m to 4 m and 8 m (1x, 2x, 4x). Features of untrained layers, "
+    "random weights alike, are compared at the same surface points, away from the views' borders. "
+    "Change: |f_s(p) - f_1(p)| over the standard deviation of f_1 over the surface, norms over 16 "
+    "filters, median and quartiles over points and seeds; 0 is the same feature, about 1.41 one "
+    "that has nothing to do with it. Correlation: of f_s and f_1 over points and filters. "
+    "Reference depth is at 2x unless the case says otherwise; tap spacings are those of such a "
+    "layer. Textures are sums of waves: one wavelength, coarse octaves (16, 32, 64 taps) or all "
+    "octaves (2 to 64), of which no pixel at 4x can hold the finest. *Perfect interpolation* is "
+    "what a layer would do that read the surface itself under each view's pixel blur. Levels are "
+    "equally wide in log depth, a factor of 8 in all, shifted from seed to seed. Expected before "
+    "it was measured: next to no change in continuous mode where texture is coarse against taps "
+    "and pixels, some in levels mode (half a level), much in nn.Conv2d; all fail on texture finer "
+    "than the distant pixel.",
     jobs,
     pivot="distances",
     method="The invariance suite times nothing: it renders views (benchmarks/scene.py) and "
