@@ -30,8 +30,8 @@ class Net:
     Attributes:
         name: in the report.
         kernel: size of every filter.
-        stride: of the first layer.
-        layers: how many.
+        stride: of a single layer.
+        layers: how many; several have stride 1.
         zero_sum: every filter's weights add up to zero in each channel, as an edge filter's do.
     """
 
@@ -44,8 +44,7 @@ class Net:
     @property
     def reach(self) -> int:
         """Pixels of the input, at scale 1, from an output's centre to the end of what it sees."""
-        first, more = self.kernel // 2, self.layers - 1
-        return first * (1 + more * self.stride)
+        return self.layers * (self.kernel // 2)
 
     def convolutions(self, seed: int) -> list[nn.Conv2d]:
         """The layers as nn.Conv2d initialises them."""
@@ -56,7 +55,7 @@ class Net:
                     FILTERS if number else COLOURS,
                     FILTERS,
                     self.kernel,
-                    stride=1 if number else self.stride,
+                    stride=self.stride,
                     padding=self.kernel // 2,
                 )
                 for number in range(self.layers)
@@ -96,10 +95,6 @@ def features(convs: Sequence[nn.Conv2d], view: View) -> Tensor:
     with torch.no_grad():
         for number, conv in enumerate(convs):
             values = values.relu() if number else values
-            if number and depth.shape[1:] != values.shape[2:]:
-                # An odd kernel padded by half of itself has its centres on every stride-th pixel.
-                stride = convs[0].stride[0]
-                depth = depth[:, ::stride, ::stride]
             values = conv(values, depth) if isinstance(conv, SurfConv2d) else conv(values)
     return values[0]
 
@@ -145,7 +140,6 @@ def match(views: Sequence[View], reach: int, stride: int, reference_depth: float
         seen &= ((at >= border) & (at <= size - 1 - border)).all(1)
         nearest = at.round().long().clamp(0, size - 1)
         place = nearest[:, 1] * size + nearest[:, 0]
-        seen &= depth > 0
         seen[seen.clone()] = cast(view.facets, view.camera, at[seen]).facet == facets[seen]
         widest = math.ceil(WIDEST * reference_depth * reach / float(view.depth.min()))
         inside &= uniform(view.facet, max(reach, widest) + 1).flatten()[place]

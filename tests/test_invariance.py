@@ -96,6 +96,15 @@ def test_the_camera_has_no_unit_of_length() -> None:
     torch.testing.assert_close(views[1].depth, 4 * views[0].depth)
 
 
+def test_distance_is_a_larger_footprint_on_a_coarser_grid() -> None:
+    texture = make_waves([0.5, 0.11], seed=2)
+    near = render(wall(2.0), texture, Camera(SIZE, FOCAL), footprint=2.0).image
+    far = render(wall(2.0), texture, Camera(SIZE, FOCAL, 2.0)).image
+    quarter, half = SIZE // 4, SIZE // 2
+    expected = far[:, quarter : quarter + half, quarter : quarter + half]
+    torch.testing.assert_close(near[:, ::2, ::2], expected, rtol=0, atol=ROUNDING)
+
+
 def test_a_wall_moved_by_whole_pixels_moves_its_image() -> None:
     texture = make_waves([0.5, 0.11], seed=2)
     facet = wall(2.0)[0]
@@ -122,6 +131,15 @@ def test_a_box_hides_what_is_behind_it_and_its_edge_is_mixed() -> None:
     # The side's far edge runs through the middle of pixel 8: half of it is wall.
     assert view.image[:, 32, 32 + 8].tolist() == [0.5] * 3
     assert view.image[0, 32, 32 + 7] == 1.0 and view.image[0, 32, 32 + 9] == 0.0
+
+    def width(place: Tensor, sides: Tensor) -> Tensor:
+        return sides[:, 0, 0].abs().repeat(3, 1)
+
+    # The parts of a pixel beside an edge have footprints of their own; a pixel of wall is 1/16 m.
+    widths = render(faces, width, camera).image[0, :, 32 + 24]
+    # The front's upper edge lies in row 16 above the axis.
+    assert float(widths[32 - 18]) == 1 / 16
+    assert float(widths[32 - 17]) == 1 / 16 / scene.EDGE_RAYS
     with pytest.raises(ValueError, match="rays meet none"):
         render(scene.box((0.0, 0.0, 2.0), (1.0, 1.0, 3.0)), flat, camera)
 
@@ -195,6 +213,16 @@ def test_on_a_ramp_continuous_mode_does_not_change_and_conv2d_as_computed(
         assert expected > 1e-3 and continuous.ratio == pytest.approx(0, abs=1e-2)
         levels = found[invariance.LEVELS, f"{times}x"]
         assert 10 * FEATURE_ROUNDING < levels.value < conv2d.value
+
+
+def test_where_all_taps_are_on_pixels_continuous_mode_is_perfect_interpolation() -> None:
+    rows = invariance.measure(Case("t", "c", reference="4x"), SIZE, 1)
+    found = {(row.subject, row.depth, row.unit): row.value for row in rows}
+    for distance in ("2x", "4x"):
+        for unit in (invariance.CHANGE, invariance.CORRELATION):
+            limit = found[invariance.LIMIT, distance, unit]
+            own = found[invariance.CONTINUOUS, distance, unit]
+            assert own == pytest.approx(limit, rel=1e-4) and own > 0.05
 
 
 def test_changes_and_correlation_by_hand() -> None:
