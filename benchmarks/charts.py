@@ -35,6 +35,7 @@ def draw(folder: Path, rows: Sequence[Row], machine: dict[str, Any]) -> dict[str
     from matplotlib import pyplot
 
     import charts_bars
+    import charts_invariance
     import charts_price
     import charts_scaling
 
@@ -49,6 +50,7 @@ def draw(folder: Path, rows: Sequence[Row], machine: dict[str, Any]) -> dict[str
         "scaling": charts_scaling.scaling,
         "memory": charts_bars.memory,
         "net": charts_bars.net,
+        "invariance": charts_invariance.invariance_chart,
     }
     names: dict[str, list[str]] = {}
     for suite, drawing in drawings.items():

@@ -16,6 +16,7 @@ COLOURS = {
     "nn.Conv2d": "0.55",
     "SurfConv2d continuous": "#0072B2",
     "SurfConv2d 4 levels": "#E69F00",
+    "SurfConv2d 8 levels": "#CC79A7",
     "SurfConv2d continuous, depth window": "#56B4E9",
     "SurfConv2d continuous, gradient of depth too": "#56B4E9",
     "SurfConv2d 4 levels, same level only": "#D55E00",

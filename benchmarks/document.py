@@ -85,7 +85,7 @@ def _shortfall(row: Row) -> float:
     return 1 / part if row.target_sense == "at least" else part
 
 
-def _pivot(rows: Sequence[Row]) -> list[str]:
+def _prices(rows: Sequence[Row]) -> list[str]:
     """Prices only: one line a case, the layouts and directions side by side."""
     columns = [(direction, layout) for direction in ("forward", "backward") for layout in LAYOUTS]
     header = ["layer", "threads", "what", "depth", *(f"{d}, {layout}" for d, layout in columns)]
@@ -103,9 +103,30 @@ def _pivot(rows: Sequence[Row]) -> list[str]:
     return table(header, cells, header[4:])
 
 
+def _distances(rows: Sequence[Row]) -> list[str]:
+    """One line a case and subject, the distances side by side."""
+    distances = list(dict.fromkeys(row.depth for row in rows))
+    header = ["case", "what"]
+    for name in distances:
+        header += [f"at {name}", *(["of nn.Conv2d's"] if any(row.baseline for row in rows) else [])]
+    lines: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        cells = lines.setdefault((row.case, row.subject), [])
+        cells.append(f"{_number(row.value)} ({_number(row.low)} .. {_number(row.high)})")
+        if len(header) > 2 + len(distances):
+            goal = "" if row.target is None else f" (≤ {row.target:g})"
+            cells.append(_ratio(row).split(" (")[0] + goal)
+            cells[-1] += f" {MISSED}" if row.verdict == "missed" else ""
+    return table(header, [(*place, *cells) for place, cells in lines.items()], header[2:])
+
+
+PIVOTS = {"prices": _prices, "distances": _distances}
+
+
 def _details(rows: Sequence[Row], per_pixel: bool) -> list[str]:
     """Every number of a table; columns in which nothing differs are left out."""
     unit = rows[0].unit
+    single = all(row.samples == 1 for row in rows)
     every = {
         "case": [row.case for row in rows],
         "what": [row.subject for row in rows],
@@ -114,9 +135,9 @@ def _details(rows: Sequence[Row], per_pixel: bool) -> list[str]:
         "depth": [row.depth for row in rows],
         "dtype": [row.dtype for row in rows],
         "threads": [str(row.threads) for row in rows],
-        f"{'median ' if unit == 'ms' else ''}{unit}": [_number(row.value) for row in rows],
+        unit if single else f"median {unit}": [_number(row.value) for row in rows],
         "quartiles": [f"{_number(row.low)} .. {_number(row.high)}" for row in rows],
-        "calls": [str(row.samples) for row in rows],
+        "calls" if unit == "ms" else "samples": [str(row.samples) for row in rows],
         "ns per pixel": [
             _number(1e6 * row.value / row.pixels) if row.pixels else "" for row in rows
         ],
@@ -153,8 +174,8 @@ def _suite(suite: Suite, rows: Sequence[Row], charts: Sequence[str]) -> list[str
         lines += [f"### {name}", ""]
         details = _details(own, per_pixel=suite.name == "scaling")
         if suite.pivot:
-            lines += [*_pivot(own), ""]
-            lines += ["<details><summary>Medians and quartiles</summary>", "", *details, ""]
+            lines += [*PIVOTS[suite.pivot](own), ""]
+            lines += ["<details><summary>Every number</summary>", "", *details, ""]
             lines += ["</details>", ""]
         else:
             lines += [*details, ""]
@@ -193,6 +214,7 @@ def render(report: Report, charts: dict[str, list[str]]) -> str:
         "Ratios are ratios of medians, with the quartiles of the rounds' own ratios behind them.",
         "",
     ]
+    lines += [line for suite in report.suites if suite.method for line in (suite.method, "")]
     lines += [f"Not measured: {name}, because {why}" for name, why in report.unavailable.items()]
     lines += ["", *_verdicts(report.rows, report.suites)]
     for suite in report.suites:

@@ -22,6 +22,7 @@ FULL_SECONDS = {
     "scaling": 26.0,
     "memory": 14.0,
     "net": 14.0,
+    "invariance": 7.0,
 }
 #: Adds up to less than a minute.
 QUICK_SECONDS = {
@@ -36,6 +37,7 @@ QUICK_SECONDS = {
     "scaling": 4.0,
     "memory": 3.0,
     "net": 4.0,
+    "invariance": 2.0,
 }
 
 

@@ -64,6 +64,11 @@ NET = Target(1.6)
 MEMORY = Target(1.10)
 HALF_TYPES = Target(1.5)
 
+#: Most that features may change with distance in continuous mode, in times of nn.Conv2d's change,
+#: on a wall whose texture's wavelength is at least so many tap spacings.
+INVARIANCE = Target(0.25)
+COARSE_TAPS = 16
+
 #: How many times as long as SurfConv2d each peer has to take.
 PEERS = {
     "grid_sample + einsum": Target(3.0, at_least=True),

@@ -7,6 +7,7 @@ from suites import (
     conv3d,
     dtypes,
     grouped,
+    invariance,
     layers,
     levels,
     memory,
@@ -29,5 +30,6 @@ SUITES: dict[str, Suite] = {
         scaling,
         memory,
         net,
+        invariance,
     )
 }

@@ -44,5 +44,5 @@ SUITE = Suite(
     "after its strides: there the fixed cost of a call counts. 1x1 kernels are plain convolutions "
     "at any scale and have no target.",
     jobs,
-    pivot=True,
+    pivot="prices",
 )

@@ -28,5 +28,5 @@ SUITE = Suite(
     "Depthwise and grouped layers",
     "Prices as above, for layers in which each channel sees only a few others.",
     jobs,
-    pivot=True,
+    pivot="prices",
 )

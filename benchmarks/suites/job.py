@@ -38,14 +38,17 @@ class Suite:
         title: heading of its part of the report.
         about: what the numbers mean, for a reader of the report.
         jobs: the jobs of a plan.
-        pivot: the report shows layouts and directions side by side.
+        pivot: what the report shows side by side: "" (one line a row), "prices" (layouts and
+            directions) or "distances".
+        method: a sentence for the head of the report, where nothing is timed.
     """
 
     name: str
     title: str
     about: str
     jobs: Callable[[Plan], list[Job]]
-    pivot: bool = False
+    pivot: str = ""
+    method: str = ""
 
 
 def work_of(macs: int, direction: str, calls: int, threads: int = 1) -> float:

@@ -38,5 +38,5 @@ SUITE = Suite(
     "against the faster of nn.Conv2d's two layouts (input, weight and bias). The table `guide` "
     "holds what a guide adds to the mode that it is used with.",
     jobs,
-    pivot=True,
+    pivot="prices",
 )
