@@ -307,24 +307,27 @@ def _center(table: DepthTable, gamma: float, start: int, stop: int) -> float:
     """Importance-weighted mean depth of some rows."""
     rows = table.rows(start, stop)
     weight = row_importance(rows, gamma)
-    # Relative to the largest depth, whose product with a weight could overflow.
-    largest = float(rows.high[-1])
-    mean = largest * (math.fsum(weight * (rows.mean / largest)) / math.fsum(weight))
-    return min(max(mean, float(rows.low[0])), largest)
+    low, high = float(rows.low[0]), float(rows.high[-1])
+    # The product of a depth and a weight could overflow; a power of two divides without rounding.
+    unit = math.ldexp(1.0, math.frexp(high)[1] - 1)
+    mean = float(np.sum(weight * (rows.mean / unit)) / np.sum(weight)) * unit
+    return min(max(mean, low), high)
 
 
 def _warn_of_fewer_levels(
     table: DepthTable, reached: NDArray[np.intp], num_levels: int, made: int
 ) -> None:
     distinct = len(table.pixels)
-    if distinct < num_levels:
+    if distinct < num_levels and (table.low == table.high).all():
         reason = f"there are only {distinct} distinct depths"
     else:
-        row = int(np.bincount(reached).argmax())
+        row = int(np.bincount([*reached, distinct - 1]).argmax())
+        low, high = (f"{end[row]:.6g}" for end in (table.low, table.high))
         share = table.pixels[row] / table.pixels.sum()
         reason = (
-            f"the depth {table.high[row]:.6g} m alone, {share:.1%} of the valid pixels, holds more"
-            " than one level's share of the importance; saturated pixels that should be holes?"
+            f"{low if low == high else f'{low} to {high}'} m alone, {share:.1%} of the valid"
+            " pixels, holds at least one level's share of the importance; saturated pixels that"
+            " should be holes?"
         )
     warnings.warn(
         f"depth levels: asked for {num_levels}, made {made}, because {reason}",
