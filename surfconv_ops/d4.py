@@ -319,7 +319,7 @@ def _warn_of_fewer_levels(
 ) -> None:
     distinct = len(table.pixels)
     if distinct < num_levels and (table.low == table.high).all():
-        reason = f"there are only {distinct} distinct depths"
+        reason = "that is how many distinct depths there are"
     else:
         row = int(np.bincount([*reached, distinct - 1]).argmax())
         low, high = (f"{end[row]:.6g}" for end in (table.low, table.high))
