@@ -1,59 +1,50 @@
-"""``python -m surfconv_ops levels``: what it reads, prints, writes and draws, and how it fails."""
+"""``python -m surfconv_ops levels``: what it reads, prints, writes and draws."""
 
 from __future__ import annotations
 
-import os
+import functools
 import re
-import subprocess
-import sys
 import weakref
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 import oracle_d4
-from surfconv_ops import DepthLevels, cli, d4, fit_depth_levels
+from cli_runner import UNIT, Run, frames, run_levels, save_frames
+from surfconv_ops import DepthLevels, d4, fit_depth_levels
 from surfconv_ops.cli import levels as command
-from surfconv_ops.cli.depth_files import find_files
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Image = pytest.importorskip("PIL.Image", reason="Pillow reads and writes the files")
 pytest.importorskip("matplotlib", reason="draws the picture")
 pytest.importorskip("tqdm", reason="shows the progress")
 
-Run = Callable[..., tuple[int, str, str]]
-UNIT = 0.001
-
 
 @pytest.fixture
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
-    """Runs the command in an empty folder: exit status, standard output, standard error."""
+    """Runs the command in an empty folder."""
     monkeypatch.chdir(tmp_path)
-
-    def run_command(*arguments: object) -> tuple[int, str, str]:
-        try:
-            status = cli.main(["levels", *map(str, arguments)])
-        except SystemExit as error:
-            status = error.code if isinstance(error.code, int) else 1
-        return status, *capsys.readouterr()
-
-    return run_command
+    return functools.partial(run_levels, capsys)
 
 
-def frames(count: int = 3) -> list[np.ndarray]:
-    """Depth in millimetres with holes."""
-    rng = np.random.default_rng(0)
-    depth = rng.lognormal(8.0, 0.5, (count, 20, 30)).clip(1, 60_000).astype(np.uint16)
-    depth[rng.random(depth.shape) < 0.2] = 0
-    return list(depth)
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that the command draws."""
+    from surfconv_ops.cli import levels_picture
 
+    figures: list[Figure] = []
+    draw = levels_picture.draw_picture
 
-def save_frames(folder: Path, images: list[np.ndarray]) -> None:
-    folder.mkdir(exist_ok=True)
-    for number, image in enumerate(images):
-        Image.fromarray(image).save(folder / f"frame_{number}.png")
+    def keep(summary: command.Summary) -> Figure:
+        figures.append(draw(summary))
+        return figures[-1]
+
+    monkeypatch.setattr(levels_picture, "draw_picture", keep)
+    return figures
 
 
 def rows(text: str) -> list[list[float]]:
@@ -105,31 +96,6 @@ def test_reference_depth(run: Run, tmp_path: Path) -> None:
     assert not (tmp_path / "levels.png").exists()
 
 
-def test_units_and_formats_agree(run: Run, tmp_path: Path) -> None:
-    counts = frames(2)
-    save_frames(tmp_path / "png", counts)
-    np.save(tmp_path / "counts.npy", np.stack(counts))
-    np.save(tmp_path / "metres.npy", np.stack(counts) * UNIT)
-    np.savez(tmp_path / "one.npz", anything=np.stack(counts))
-    np.savez(tmp_path / "two.npz", depth=np.stack(counts), other=np.ones(3))
-    Image.fromarray(np.concatenate(counts).astype(np.float32)).save(tmp_path / "float.tiff")
-    Image.fromarray(np.concatenate(counts).astype(np.int32)).save(tmp_path / "int.tiff")
-    expected = fit_depth_levels(np.stack(counts) * UNIT, 4)
-    for pattern, unit in [
-        ("png/*", "0.001"),
-        ("png/*", "1/1000"),
-        ("counts.npy", "1e-3"),
-        ("metres.npy", "1"),
-        ("one.npz", "0.001"),
-        ("two.npz", "0.001"),
-        ("float.tiff", "0.001"),
-        ("int.tiff", "0.001"),
-    ]:
-        status, _, err = run(pattern, "--unit", unit, "--no-plot")
-        assert status == 0, err
-        assert DepthLevels.load("levels.json").edges == pytest.approx(expected.edges, rel=1e-12)
-
-
 def test_what_counts_as_a_hole(run: Run, tmp_path: Path) -> None:
     image = np.array([[1000, 2000, 3000, 4000, 9000, 65535, 65535, 0]], np.uint16)
     save_frames(tmp_path / "depth", [image])
@@ -165,20 +131,14 @@ def test_levels_from_bins(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize("gamma", [0.0, 1.0, 2.0])
-def test_coloured_areas_are_the_shares(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                       gamma: float) -> None:  # fmt: skip
+def test_coloured_areas_are_the_shares(
+    drawn: list[Figure], run: Run, tmp_path: Path, gamma: float
+) -> None:
     from matplotlib.patches import StepPatch
 
-    from surfconv_ops.cli import levels_picture
-
-    figures = []
-    draw = levels_picture.draw_picture
-    monkeypatch.setattr(
-        levels_picture, "draw_picture", lambda summary: figures.append(draw(summary)) or figures[0]
-    )
     save_frames(tmp_path / "depth", frames())
     _, out, _ = run("depth/*.png", "--unit", UNIT, "--gamma", gamma)
-    panels = figures[0].axes
+    panels = drawn[0].axes
     assert len(panels) == (1 if gamma == 0 else 2)
     for panel, column in zip(panels, (4, 5), strict=False):
         bands = [patch for patch in panel.patches if isinstance(patch, StepPatch)]
@@ -211,18 +171,10 @@ def test_pictures_of_odd_data(run: Run, tmp_path: Path, image: np.ndarray, name:
     assert len(DepthLevels.load("new/levels.json")) == len(rows(out))
 
 
-def test_far_pixels_do_not_squeeze_the_picture(run: Run, tmp_path: Path) -> None:
-    depth = np.append(np.random.default_rng(0).uniform(1.0, 4.0, 9999), 5000.0)
-    np.save(tmp_path / "depth.npy", depth)
-    from surfconv_ops.cli import levels_picture
-
-    parser_options = ["depth.npy", "--unit", "1", "--gamma", "0", "--no-plot"]
-    summaries = []
-    keep = command.summarise
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(command, "summarise", lambda *a: summaries.append(keep(*a)) or summaries[0])
-        run(*parser_options)
-    (panel,) = levels_picture.draw_picture(summaries[0]).axes
+def test_far_pixels_do_not_squeeze_the_picture(drawn: list[Figure], run: Run) -> None:
+    np.save("depth.npy", np.append(np.random.default_rng(0).uniform(1.0, 4.0, 9999), 5000.0))
+    run("depth.npy", "--unit", 1, "--gamma", 0)
+    (panel,) = drawn[0].axes
     assert panel.get_xlim()[1] < 10
     assert "0.01 % of the pixels lie beyond" in panel.get_xlabel()
 
@@ -243,133 +195,6 @@ def test_one_file_in_memory_at_a_time(
     monkeypatch.setattr(command, "read_counts", watched)
     assert run("depth/*.png", "--unit", UNIT, "--no-plot")[0] == 0
     assert len(alive) == 8
-
-
-def test_find_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    names = ["a/img_10.png", "a/img_2.png", "b/c/img_1.png", "x[1].png"]
-    for name in names:
-        Path(name).parent.mkdir(parents=True, exist_ok=True)
-        Path(name).touch()
-    found = [path.as_posix() for path in find_files(["**/*.png", "a/*", "./x[1].png"])]
-    assert found == ["a/img_2.png", "a/img_10.png", "b/c/img_1.png", "x[1].png"]
-
-
-def test_files_that_are_not_there(run: Run, tmp_path: Path) -> None:
-    (tmp_path / "folder").mkdir()
-    status, _, err = run("nothing/*.png", "--unit", UNIT)
-    assert status == 1 and f"no file matches 'nothing/*.png' (seen from {tmp_path})" in err
-    status, _, err = run("folder", "--unit", UNIT)
-    assert status == 1 and "no file matches 'folder' (it means folders only)" in err
-
-
-def write_bad_files(folder: Path) -> None:
-    grey = np.full((4, 5), 100, np.uint8)
-    Image.fromarray(grey).save(folder / "grey.png")
-    Image.fromarray(np.stack([grey] * 3, -1)).save(folder / "rgb.png")
-    Image.fromarray(grey).convert("P").save(folder / "palette.png")
-    Image.fromarray(np.full((40, 50), 1000, np.uint16)).save(folder / "cut.png")
-    (folder / "cut.png").write_bytes((folder / "cut.png").read_bytes()[:60])
-    (folder / "text.png").write_text("no image")
-    (folder / "text.npy").write_text("no array")
-    (folder / "text.npz").write_text("no archive")
-    np.save(folder / "object.npy", np.array([{}]), allow_pickle=True)
-    np.save(folder / "byte.npy", grey)
-    np.save(folder / "complex.npy", np.ones(3, complex))
-    np.savez(folder / "many.npz", a=grey, b=grey)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("grey.png", r"one channel of 16 bits or more, got .*8-bit grey"),
-        ("rgb.png", r"one channel of 16 bits or more, got .*RGB.* sensor's own files"),
-        ("palette.png", r"one channel of 16 bits or more, got .*palette"),
-        ("cut.png", "cannot be read as an image"),
-        ("text.png", "cannot be read as an image"),
-        ("text.npy", "cannot be read as an array"),
-        ("text.npz", "cannot be read as an array"),
-        ("object.npy", "cannot be read as an array"),
-        ("byte.npy", r"16 bits or more, got an array of uint8"),
-        ("complex.npy", "expected numbers, got complex128"),
-        ("many.npz", r"expected one array, or one named 'depth', got a, b"),
-    ],
-)
-def test_files_that_hold_no_depth(run: Run, tmp_path: Path, name: str, message: str) -> None:
-    write_bad_files(tmp_path)
-    status, out, err = run(name, "--unit", UNIT)
-    assert status == 1 and not out
-    assert re.search(rf"levels: error: {re.escape(name)}: .*{message}", err)
-    assert not (tmp_path / "levels.json").exists()
-
-
-def test_nothing_but_holes(run: Run, tmp_path: Path) -> None:
-    save_frames(tmp_path / "depth", [np.zeros((4, 5), np.uint16), np.full((4, 5), 9000, np.uint16)])
-    status, _, err = run("depth/*.png", "--unit", UNIT, "--max-depth", 8)
-    assert status == 1
-    assert "no valid depth in 2 files: every pixel of 40 is 0" in err and "--max-depth" in err
-
-
-@pytest.mark.parametrize(
-    ("module", "package"), [("PIL.Image", "Pillow"), ("matplotlib", "matplotlib"), ("tqdm", "tqdm")]
-)
-def test_missing_packages(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, package: str
-) -> None:
-    save_frames(tmp_path / "depth", frames(1))
-    monkeypatch.setitem(sys.modules, module, None)
-    status, _, err = run("depth/*.png", "--unit", UNIT)
-    assert status == 1
-    assert f"{package} is needed" in err and "pip install 'surfconv_ops[cli]'" in err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "--unit is missing: .*0.001 where a count is a millimetre"),
-        (["--unit", "0"], "argument --unit: expected a positive, finite number, got '0'"),
-        (["--unit", "1/0"], "argument --unit: expected a number or a fraction"),
-        (["--unit", "mm"], "argument --unit: expected a number or a fraction"),
-        (["--unit", "1", "--levels", "0"], "argument --levels: expected 1 or more, got 0"),
-        (["--unit", "1", "--levels", "2.5"], "argument --levels: expected a whole number"),
-        (["--unit", "1", "--gamma", "nan"], "argument --gamma: expected a finite number"),
-        (["--unit", "1", "--gamma", "x"], "argument --gamma: expected a number"),
-        (["--unit", "1", "--reference-depth", "-1"], "argument --reference-depth: expected a pos"),
-        (["--unit", "1", "--plot", "levels.txt"], "--plot: expected a file ending in .*.png"),
-    ],
-)
-def test_wrong_arguments(run: Run, arguments: list[str], message: str) -> None:
-    status, out, err = run("depth/*.png", *arguments)
-    assert status == 2 and not out
-    assert re.search(message, err) and err.startswith("usage: ")
-
-
-def test_results_that_cannot_be_written(run: Run, tmp_path: Path) -> None:
-    save_frames(tmp_path / "depth", frames(1))
-    (tmp_path / "taken").mkdir()
-    status, _, err = run("depth/*.png", "--unit", UNIT, "--out", "taken")
-    assert status == 1 and "cannot write taken: " in err
-    (tmp_path / "file").touch()
-    status, _, err = run("depth/*.png", "--unit", UNIT, "--out", "file/levels.json")
-    assert status == 1 and "cannot make the folder of file" in err
-
-
-def call(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    root = Path(__file__).resolve().parent.parent
-    environment: dict[str, Any] = {**os.environ, "PYTHONPATH": str(root)}
-    return subprocess.run(
-        [sys.executable, "-m", "surfconv_ops", *arguments],
-        cwd=folder, env=environment, capture_output=True, text=True, timeout=120, check=False,
-    )  # fmt: skip
-
-
-def test_as_a_program(tmp_path: Path) -> None:
-    assert call("--help", folder=tmp_path).stdout.startswith("usage: python -m surfconv_ops")
-    help_text = call("levels", "--help", folder=tmp_path).stdout
-    assert "examples:" in help_text and "--unit 90/65535" in help_text
-    failed = call("levels", "*.png", "--unit", "1", folder=tmp_path)
-    assert failed.returncode == 1 and "Traceback" not in failed.stderr
-    assert failed.stderr.startswith("python -m surfconv_ops levels: error: no file matches")
 
 
 def test_kitti(run: Run, data_folder: Path) -> None:
