@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Iterable
 from typing import Any
 
@@ -13,22 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from .checks import check_finite, check_integer, type_name
-from .depth_table import (
-    DepthTable,
-    add_tables,
-    distinct_depths,
-    into_bins,
-    row_importance,
-    valid_values,
-)
+from .depth_table import DepthTable, add_tables, distinct_depths, into_bins, valid_values
 from .levels import DepthLevels
+from .levels_fit import fit_table
 
 #: Distinct depths that D4 keeps one by one before it gathers them in bins. A 16-bit sensor has
 #: at most half as many.
 EXACT_LIMIT = 2**17
-#: A sum short of a level's share by this much of it is taken to reach it. Depths that part evenly
-#: would otherwise have their edge across the next gap whenever their powers round.
-ROUNDING = 1e-12
 
 
 class D4:
@@ -213,7 +202,7 @@ class D4:
             >>> D4(2, gamma=0.0).update(torch.tensor([1.0, 2.0, 3.0, 5.0])).fit()
             DepthLevels(edges=(2.0,), centers=(1.5, 4.0), gamma=0.0)
         """
-        return _fit(self._table, self._pixels, self.num_levels, self.gamma)
+        return fit_table(self._table, self._pixels, self.num_levels, self.gamma)
 
     def _add(self, table: DepthTable, exact: bool, pixels: int) -> None:
         ours = self._table
@@ -275,7 +264,7 @@ def fit_depth_levels(
     elif isinstance(depths, Iterable):
         for depth in depths:
             d4.update(depth)
-        return _fit(d4.table, d4.pixels, d4.num_levels, d4.gamma)
+        return fit_table(d4.table, d4.pixels, d4.num_levels, d4.gamma)
     else:
         raise TypeError(
             f"depths: expected a tensor, an array, or an iterable of them, got {type_name(depths)}"
@@ -283,51 +272,4 @@ def fit_depth_levels(
     parts = [valid_values(depth, name) for depth, name in zip(depths, names, strict=True)]
     values = np.concatenate([np.empty(0, np.float32), *(part for part, _ in parts)])
     pixels = sum(count for _, count in parts)
-    return _fit(distinct_depths(values), pixels, d4.num_levels, d4.gamma)
-
-
-def _fit(table: DepthTable, pixels: int, num_levels: int, gamma: float) -> DepthLevels:
-    if not len(table.pixels):
-        reason = f"none of {pixels} pixels is positive and finite" if pixels else "there are none"
-        raise ValueError(f"depths: expected at least one valid depth, but {reason}")
-    cumulative = np.cumsum(row_importance(table, gamma))
-    shares = np.arange(1, num_levels) * cumulative[-1]
-    reached = np.searchsorted(cumulative * num_levels, shares * (1 - ROUNDING))
-    last = len(table.pixels) - 1
-    ends = np.unique(reached[reached < last])
-    if len(ends) < num_levels - 1:
-        _warn_of_fewer_levels(table, reached, num_levels, len(ends) + 1)
-    starts = [0, *(ends + 1).tolist()]
-    stops = [*starts[1:], last + 1]
-    centers = [_center(table, gamma, *rows) for rows in zip(starts, stops, strict=True)]
-    return DepthLevels(tuple(table.high[ends].tolist()), tuple(centers), gamma)
-
-
-def _center(table: DepthTable, gamma: float, start: int, stop: int) -> float:
-    """Importance-weighted mean depth of some rows."""
-    rows = table.rows(start, stop)
-    weight = row_importance(rows, gamma)
-    # Relative to the largest depth, whose product with a weight could overflow.
-    largest = float(rows.high[-1])
-    mean = largest * (math.fsum(weight * (rows.mean / largest)) / math.fsum(weight))
-    return min(max(mean, float(rows.low[0])), largest)
-
-
-def _warn_of_fewer_levels(
-    table: DepthTable, reached: NDArray[np.intp], num_levels: int, made: int
-) -> None:
-    distinct = len(table.pixels)
-    if distinct < num_levels:
-        reason = f"there are only {distinct} distinct depths"
-    else:
-        row = int(np.bincount(reached).argmax())
-        share = table.pixels[row] / table.pixels.sum()
-        reason = (
-            f"the depth {table.high[row]:.6g} m alone, {share:.1%} of the valid pixels, holds more"
-            " than one level's share of the importance; saturated pixels that should be holes?"
-        )
-    warnings.warn(
-        f"depth levels: asked for {num_levels}, made {made}, because {reason}",
-        UserWarning,
-        stacklevel=4,
-    )
+    return fit_table(distinct_depths(values), pixels, d4.num_levels, d4.gamma)
