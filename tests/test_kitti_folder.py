@@ -21,7 +21,7 @@ def frames(tmp_path: Path) -> Path:
 
 
 def test_frames_come_in_natural_order_and_in_metres(frames: Path) -> None:
-    folder = FrameFolder(frames, 12)
+    folder = FrameFolder(frames)
     assert folder.names == NAMES
     frame = folder.frame("img_2")
     counts = np.array(Image.open(frames / "depth" / "img_2.png"))
@@ -31,17 +31,34 @@ def test_frames_come_in_natural_order_and_in_metres(frames: Path) -> None:
 
 
 def test_a_unit_beside_the_folders_is_used(frames: Path) -> None:
-    before = FrameFolder(frames, 12).depth("img_1")
+    before = FrameFolder(frames).depth("img_1")
     (frames / "dataset.json").write_text('{"metres_per_count": 0.001}')
-    after = FrameFolder(frames, 12).depth("img_1")
+    after = FrameFolder(frames).depth("img_1")
     torch.testing.assert_close(after, before * (0.001 * 65535 / 90))
     (frames / "dataset.json").write_text('{"metres_per_count": 0}')
     with pytest.raises(FolderError, match="positive number under metres_per_count"):
-        FrameFolder(frames, 12)
+        FrameFolder(frames)
+
+
+def test_classes_beside_the_folders_are_used(frames: Path) -> None:
+    assert len(FrameFolder(frames).class_names) == 12
+    (frames / "dataset.json").write_text('{"classes": ["ignored", "wall", "floor"]}')
+    folder = FrameFolder(frames)
+    assert folder.class_names == ("ignored", "wall", "floor")
+    with pytest.raises(FolderError, match=r"holds class 3; expected 0 .* to 2"):
+        folder.frame("img_1")
+    for text, message in (
+        ('{"classes": []}', "2 to 256 names"),
+        ('{"classes": 3}', "cannot be read"),
+        ("no JSON", "cannot be read"),
+    ):
+        (frames / "dataset.json").write_text(text)
+        with pytest.raises(FolderError, match=message):
+            FrameFolder(frames)
 
 
 def test_the_networks_input_is_rgb_then_hha_around_zero(frames: Path) -> None:
-    frame = FrameFolder(frames, 12).frame("img_1")
+    frame = FrameFolder(frames).frame("img_1")
     input = network_input(frame)
     assert input.shape == (6, *SIZE) and input.is_contiguous()
     assert input[2, 5, 7].item() == pytest.approx((float(frame.rgb[5, 7, 2]) - 90.96) / 64)
@@ -66,31 +83,31 @@ def test_a_wrong_picture_is_named(
 ) -> None:
     _replace(frames, folder, picture)
     with pytest.raises(FolderError, match=message):
-        FrameFolder(frames, 12).frame("img_2")
+        FrameFolder(frames).frame("img_2")
 
 
 def test_a_broken_picture_is_named(frames: Path) -> None:
     (frames / "rgb" / "img_2.png").write_bytes(b"no picture")
     with pytest.raises(FolderError, match=r"rgb/img_2.png is not a picture"):
-        FrameFolder(frames, 12).frame("img_2")
+        FrameFolder(frames).frame("img_2")
 
 
 def test_what_is_missing_is_named(frames: Path, tmp_path: Path) -> None:
     with pytest.raises(FolderError, match="nowhere is not a folder; expected one with the folders"):
-        FrameFolder(tmp_path / "nowhere", 12)
+        FrameFolder(tmp_path / "nowhere")
     (frames / "hha" / "img_10.png").unlink()
     with pytest.raises(FolderError, match=r"hha lacks 1 of 3 frames .*: img_10.png"):
-        FrameFolder(frames, 12)
+        FrameFolder(frames)
     for path in (frames / "hha").iterdir():
         path.unlink()
     (frames / "hha").rmdir()
     with pytest.raises(FolderError, match="has no folder hha; expected the folders rgb/"):
-        FrameFolder(frames, 12)
+        FrameFolder(frames)
     empty = tmp_path / "empty"
     for name in ("rgb", "depth", "hha", "label"):
         (empty / name).mkdir(parents=True)
     with pytest.raises(FolderError, match=r"no .png file in any of rgb, depth, hha and label"):
-        FrameFolder(empty, 12)
+        FrameFolder(empty)
 
 
 def test_a_split_keeps_the_named_frames_apart(tmp_path: Path) -> None:
@@ -109,7 +126,7 @@ def test_a_split_keeps_the_named_frames_apart(tmp_path: Path) -> None:
 
 
 def test_the_real_frames_and_their_split(data_folder: Path) -> None:
-    folder = FrameFolder(data_folder / "kitti", 12)
+    folder = FrameFolder(data_folder / "kitti")
     train, kept = split(folder.names, EXAMPLE / "validation.txt")
     assert (len(train), len(kept)) == (56, 14) and folder.names[:2] == ["img_1", "img_2"]
     frame = folder.frame("img_3")

@@ -222,7 +222,7 @@ def test_the_export_is_a_folder_that_training_reads(mat: Path, tmp_path: Path) -
     assert nyuv2.main([*arguments, "--out", str(out)]) == 0
     assert (out / "train.txt").read_text() == "0001\n0004\n"
     assert (out / "test.txt").read_text() == "0002\n0003\n"
-    folder = FrameFolder(out, 12)
+    folder = FrameFolder(out)
     assert folder.names == ["0001", "0002", "0003", "0004"]
     arrays = matlab_arrays()
     table = np.array([0, 1, 2, 11, 0, 7])

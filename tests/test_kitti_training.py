@@ -205,6 +205,22 @@ def test_bad_arguments_end_with_a_message(frames: Path, tmp_path: Path) -> None:
             )
 
 
+def test_the_folder_says_how_many_classes_there_are(frames: Path) -> None:
+    train_script.main(arguments(frames, "twelve", "--epochs", "1"))
+    names = '{"classes": ["ignored", "red", "green", "blue"]}'
+    (frames / "dataset.json").write_text(names)
+    train_script.main(arguments(frames, "four", "--epochs", "1"))
+    runs = frames.parent
+    four = read_checkpoint(runs / "four" / "best.pt")
+    assert four["settings"].classes == 4 and four["model"]["scores.weight"].shape[0] == 4
+    evaluate_script.main(["--checkpoint", str(runs / "four" / "best.pt"), "--data", str(frames)])
+    with pytest.raises(SystemExit, match="has 4 classes, the net was trained for 12"):
+        evaluate_script.main(
+            ["--checkpoint", str(runs / "twelve" / "best.pt"), "--data", str(frames)]
+        )
+
+
 def test_settings_and_arguments_have_the_same_names(frames: Path) -> None:
     parsed = vars(train_script.parse(arguments(frames, "run")))
-    assert {f.name for f in dataclasses.fields(Settings)} <= set(parsed)
+    # The number of classes is the folder's to say.
+    assert {f.name for f in dataclasses.fields(Settings)} - {"classes"} <= set(parsed)

@@ -17,10 +17,10 @@ import numpy as np
 from torch import Tensor
 from tqdm import tqdm
 
-from classes import KITTI_CLASSES, palette
+from classes import palette
 from evaluation import evaluate, report, without_nan
 from folder import FolderError, Frame, FrameFolder
-from paper_net import CLASSES, on_device
+from paper_net import on_device
 from pictures import FramePictures, page
 from segmenter import CheckpointError, read_checkpoint, restore
 
@@ -46,7 +46,12 @@ def run(args: argparse.Namespace) -> None:
     settings = content["settings"]
     device = on_device(args.device)
     model = restore(content).to(device)
-    folder = FrameFolder(args.data, CLASSES)
+    folder = FrameFolder(args.data)
+    if len(folder.class_names) != settings.classes:
+        raise FolderError(
+            f"--data: {args.data} has {len(folder.class_names)} classes, the net was trained for"
+            f" {settings.classes}"
+        )
     names = folder.names if args.names is None else _chosen(folder, args.names)
     places = np.linspace(0, len(names) - 1, min(max(args.pictures, 0), len(names)))
     shown = {names[int(place)] for place in places.round()}
@@ -64,7 +69,7 @@ def run(args: argparse.Namespace) -> None:
         f"{args.checkpoint}: {settings.mode}, epoch {content['epoch']} of {settings.epochs}, on"
         f" {len(names)} frames of {args.data}\n"
     )
-    print(report(metrics, KITTI_CLASSES))
+    print(report(metrics, folder.class_names))
     out = args.out or args.checkpoint.parent
     out.mkdir(parents=True, exist_ok=True)
     written = {
@@ -77,7 +82,7 @@ def run(args: argparse.Namespace) -> None:
         json.dumps(without_nan(written), indent=2) + "\n", encoding="utf-8"
     )
     if rows:
-        page(rows, KITTI_CLASSES, palette(CLASSES), out / "pictures.png")
+        page(rows, folder.class_names, palette(settings.classes), out / "pictures.png")
     print(f"\nwrote {out / 'metrics.json'}" + (f" and {out / 'pictures.png'}" if rows else ""))
 
 

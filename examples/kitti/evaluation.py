@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from folder import Frame, network_input
-from paper_net import CLASSES
 from segmenter import Segmenter
 from surfconv_ops import SegmentationMetrics
 
@@ -34,7 +33,7 @@ def evaluate(
         device: where the model is.
         seen: called with every frame and its prediction (H, W).
     """
-    metrics = SegmentationMetrics(CLASSES, ignore_index=0, depth_ranges=DEPTH_RANGES)
+    metrics = SegmentationMetrics(model.classes, ignore_index=0, depth_ranges=DEPTH_RANGES)
     training = model.training
     model.eval()
     with torch.no_grad():

@@ -2,11 +2,13 @@
 
     DIR/rgb/NAME.png     8-bit RGB
     DIR/depth/NAME.png   16-bit counts; 0 = no depth
-    DIR/hha/NAME.png     8-bit, 3 channels: horizontal disparity, height, angle with gravity
+    DIR/hha/NAME.png     8-bit, 3 channels: height, horizontal disparity and angle with gravity
     DIR/label/NAME.png   8-bit class ids; 0 = not labelled
 
-Metres are counts x 90 / 65535, as in the frames that the SurfConv authors published, unless
-DIR/dataset.json says otherwise: {"metres_per_count": 0.001}.
+Metres are counts x 90 / 65535 and classes KITTI's, as in the frames that the SurfConv authors
+published, unless DIR/dataset.json says otherwise:
+
+    {"metres_per_count": 0.001, "classes": ["ignored", "wall", "floor"]}
 """
 
 from __future__ import annotations
@@ -15,13 +17,15 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
+
+from classes import KITTI_CLASSES
 
 FOLDERS = ("rgb", "depth", "hha", "label")
 METRES_PER_COUNT = 90 / 65535
@@ -52,17 +56,17 @@ class FrameFolder:
 
     Args:
         path: the folder.
-        classes: number of classes; a larger label is an error.
 
     Raises:
         FolderError: A folder is missing, empty, or lacks a frame that another one has.
     """
 
-    def __init__(self, path: str | Path, classes: int) -> None:
+    def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.classes = classes
         self.names = self._find_names()
-        self.metres_per_count = self._find_unit()
+        about = self._about()
+        self.metres_per_count: float = about["metres_per_count"]
+        self.class_names: tuple[str, ...] = about["classes"]
 
     def _find_names(self) -> list[str]:
         if not self.path.is_dir():
@@ -83,17 +87,24 @@ class FrameFolder:
                 )
         return sorted(together, key=_natural)
 
-    def _find_unit(self) -> float:
+    def _about(self) -> dict[str, Any]:
+        about: dict[str, Any] = {"metres_per_count": METRES_PER_COUNT, "classes": KITTI_CLASSES}
         path = self.path / "dataset.json"
         if not path.is_file():
-            return METRES_PER_COUNT
+            return about
         try:
-            unit = float(json.loads(path.read_text(encoding="utf-8"))["metres_per_count"])
-        except (ValueError, TypeError, KeyError):
-            unit = 0.0
-        if not 0 < unit < 1000:
+            about |= json.loads(path.read_text(encoding="utf-8"))
+            about["metres_per_count"] = float(about["metres_per_count"])
+            about["classes"] = tuple(str(name) for name in about["classes"])
+        except (ValueError, TypeError) as error:
+            raise FolderError(f"{path} cannot be read: {error}") from None
+        if not 0 < about["metres_per_count"] < 1000:
             raise FolderError(f"{path}: expected a positive number under metres_per_count")
-        return unit
+        if not 1 < len(about["classes"]) <= 256:
+            raise FolderError(
+                f"{path}: expected 2 to 256 names under classes, the ignored one first"
+            )
+        return about
 
     def __len__(self) -> int:
         return len(self.names)
@@ -115,10 +126,10 @@ class FrameFolder:
                     f"{self.path}: {folder}/{name}.png has {size[1]} x {size[0]} pixels,"
                     f" depth/{name}.png {depth.shape[1]} x {depth.shape[0]}"
                 )
-        if label.max(initial=0) >= self.classes:
+        if label.max(initial=0) >= len(self.class_names):
             raise FolderError(
                 f"{self.path / 'label' / name}.png holds class {label.max()}; expected 0 (not"
-                f" labelled) to {self.classes - 1}"
+                f" labelled) to {len(self.class_names) - 1}"
             )
         return Frame(name, rgb, hha, depth, torch.from_numpy(label.astype(np.uint8)))
 

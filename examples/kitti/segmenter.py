@@ -43,6 +43,7 @@ class Settings:
     same_level_only: bool = False
     pools: bool = False
     validation: str = "kitti"
+    classes: int = CLASSES
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers and strings."""
@@ -61,7 +62,8 @@ class Segmenter(nn.Module):
         super().__init__()
         if settings.mode not in MODES:
             raise ValueError(f"mode: expected one of {MODES}, got {settings.mode!r}")
-        self.net = PaperNet(settings.capacity, classes=CLASSES)
+        self.classes = settings.classes
+        self.net = PaperNet(settings.capacity, classes=settings.classes)
         # In a list, so that the parameters are registered once and a checkpoint's keys are the
         # plain net's in every mode.
         self._runner = [_runner(settings, levels, self.net)]

@@ -26,7 +26,7 @@ from tqdm import tqdm
 from evaluation import FIGURES, evaluate, without_nan
 from folder import FolderError, Frame, FrameFolder, network_input, split
 from losses import LOSSES, segmentation_loss
-from paper_net import CLASSES, on_device, parameter_count
+from paper_net import on_device, parameter_count
 from schedules import DEFAULT_RATES, SCHEDULES, make_schedule
 from segmenter import MODES, CheckpointError, Segmenter, Settings, read_checkpoint, save_checkpoint
 from surfconv_ops import DepthLevels, fit_depth_levels
@@ -43,8 +43,10 @@ class Training:
     """A run: its data, its net, how far it is, and its folder."""
 
     def __init__(self, settings: Settings, data: Path, out: Path, device: torch.device) -> None:
-        self.settings, self.out, self.device = settings, out, device
-        self.folder = FrameFolder(data, CLASSES)
+        self.out, self.device = out, device
+        self.folder = FrameFolder(data)
+        settings = dataclasses.replace(settings, classes=len(self.folder.class_names))
+        self.settings = settings
         listed = VALIDATION_FILES.get(settings.validation, Path(settings.validation))
         self.names, self.validation_names = split(self.folder.names, listed)
         self.frame = lru_cache(maxsize=FRAMES_IN_MEMORY)(self.folder.frame)
