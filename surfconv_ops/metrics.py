@@ -63,8 +63,8 @@ class SegmentationMetrics:
         >>> metrics = SegmentationMetrics(num_classes=3)
         >>> target = torch.tensor([[[0, 1], [2, 2]]])
         >>> prediction = torch.tensor([[[1, 1], [2, 1]]])
-        >>> metrics.update(prediction, target, depth=torch.tensor([[[1.0, 1.0], [2.0, 0.0]]]))
-        >>> figures = metrics.compute()
+        >>> depth = torch.tensor([[[1.0, 1.0], [2.0, 0.0]]])
+        >>> figures = metrics.update(prediction, target, depth).compute()
         >>> round(figures["acc_img"], 4), figures["iou_img"], figures["acc_surf"]
         (0.6667, 0.5, 1.0)
     """
@@ -110,7 +110,7 @@ class SegmentationMetrics:
         prediction: Tensor | np.ndarray[Any, Any],
         target: Tensor | np.ndarray[Any, Any],
         depth: Tensor | np.ndarray[Any, Any],
-    ) -> None:
+    ) -> SegmentationMetrics:
         """Count one image or a batch; in whatever batches images come, the result is the same.
 
         Counts are exactly the same, areas to float64's rounding. A call that raises counts
@@ -125,6 +125,9 @@ class SegmentationMetrics:
         Shape:
             - prediction, target: ``(N, H, W)`` or ``(H, W)``
             - depth: the same, or ``(N, 1, H, W)``, ``(1, H, W)``
+
+        Returns:
+            This object.
 
         Raises:
             ValueError: An id is out of range, or shapes or devices differ.
@@ -158,6 +161,7 @@ class SegmentationMetrics:
             areas += more_areas
         self._counts += counts
         self._areas += areas
+        return self
 
     def _count(self, prediction: Tensor, target: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Both stacks of confusion matrices, of flat maps."""
@@ -199,11 +203,14 @@ class SegmentationMetrics:
             f" {int(ids[refused][0])}"
         )
 
-    def merge(self, other: SegmentationMetrics) -> None:
+    def merge(self, other: SegmentationMetrics) -> SegmentationMetrics:
         """Count what ``other`` has counted as well; ``other`` stays as it is.
 
         Args:
             other: Metrics with the same classes, ignored class and depth ranges.
+
+        Returns:
+            This object.
 
         Raises:
             ValueError: The two were made with different arguments.
@@ -215,30 +222,46 @@ class SegmentationMetrics:
             raise ValueError(f"other: expected the arguments of {self!r}, got {other!r}")
         self._counts = self._counts + other._counts
         self._areas = self._areas + other._areas
+        return self
 
-    def all_reduce(self, group: torch.distributed.ProcessGroup | None = None) -> None:
+    def all_reduce(
+        self, group: torch.distributed.ProcessGroup | None = None
+    ) -> SegmentationMetrics:
         """Merge the metrics of all processes: each ends up with the figures of all.
 
-        Call it once, after the last update: a second call would count everything once more for
-        every process. Samplers that pad the data to a multiple of the processes, as
-        DistributedSampler does, repeat images, and these count twice.
+        To be called by every process of the group, once the last :meth:`update` is done: a second
+        call counts everything once more. Samplers that pad the data to a multiple of the
+        processes, as DistributedSampler does, repeat images, and these count twice. The matrices
+        travel as objects; with NCCL that takes ``torch.cuda.set_device`` beforehand.
 
         Args:
-            group: Process group; None for the default one.
+            group: Process group of torch.distributed; None for the default one.
+
+        Returns:
+            This object.
 
         Raises:
-            ValueError: The processes' metrics were made with different arguments.
-            RuntimeError: There is no process group.
+            ValueError: This process is not in the group, or the processes' metrics were made with
+                different arguments.
+            RuntimeError: torch.distributed is not initialised.
         """
-        if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
-            raise RuntimeError("all_reduce: torch.distributed has no process group here")
-        every: list[Any] = [None] * torch.distributed.get_world_size(group)
+        distributed = torch.distributed
+        if not (distributed.is_available() and distributed.is_initialized()):
+            raise RuntimeError(
+                "all_reduce: torch.distributed is not initialised; call"
+                " torch.distributed.init_process_group in every process first, or add up objects"
+                " of one process with merge"
+            )
+        if distributed.get_rank(group) < 0:
+            raise ValueError("group: this process is not a member of it")
+        parts: list[Any] = [None] * distributed.get_world_size(group)
         # Gathered, not reduced, so that all processes add in one order and get the same bits.
-        torch.distributed.all_gather_object(every, self, group)
-        total = SegmentationMetrics(*self._settings()[:2], depth_ranges=self.depth_ranges)
-        for each in every:
-            total.merge(each)
-        self._counts, self._areas = total._counts, total._areas
+        distributed.all_gather_object(parts, self, group)
+        whole = parts[0]
+        for part in parts[1:]:
+            whole.merge(part)
+        self._counts, self._areas = whole._counts, whole._areas
+        return self
 
     def compute(self) -> dict[str, Any]:
         """The figures of all pixels counted so far, as plain numbers, lists and dicts.
@@ -316,4 +339,5 @@ def _counts_well(device: torch.device) -> bool:
 
 
 def _to_tensor(map: Any) -> Any:
-    return torch.from_numpy(map) if isinstance(map, np.ndarray) else map
+    # Copied: an array may be read-only or run backwards, which tensors cannot.
+    return torch.from_numpy(map.copy()) if isinstance(map, np.ndarray) else map
