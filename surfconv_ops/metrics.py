@@ -19,11 +19,11 @@ from .checks import (
     type_name,
     valid_depth,
 )
+from .figures import figures, figures_by_class
 
 #: Boundaries of the depth ranges that figures are also given for, in metres.
 DEPTH_RANGES = (0.0, 5.0, 10.0, 20.0, 40.0, math.inf)
 
-_FIGURES = ("acc_img", "iou_img", "acc_surf", "iou_surf")
 # Pixels looked at together, which bounds the memory an update works in.
 _CHUNK = 1 << 22
 # Squares of greater depths would leave float64.
@@ -281,42 +281,14 @@ class SegmentationMetrics:
             nan
         """
         counts, areas = self._counts.to(torch.float64), self._areas
-        result: dict[str, Any] = self._figures(counts.sum(0), areas.sum(0))
-        result["classes"] = self._figures_by_class(counts.sum(0), areas.sum(0))
+        whole = counts.sum(0), areas.sum(0)
+        result: dict[str, Any] = figures(*whole, self.ignore_index)
+        result["classes"] = figures_by_class(*whole, self.ignore_index)
         result["ranges"] = [
-            {"from": low, "to": high, **self._figures(counts[i], areas[i])}
+            {"from": low, "to": high, **figures(counts[i], areas[i], self.ignore_index)}
             for i, (low, high) in enumerate(self._range_pairs())
         ]
         return result
-
-    def _figures(self, counts: Tensor, areas: Tensor) -> dict[str, Any]:
-        """The four figures of one pair of confusion matrices."""
-        result: dict[str, Any] = {}
-        for suffix, confusion in (("img", counts), ("surf", areas)):
-            _, iou = self._by_class(confusion)
-            result[f"acc_{suffix}"] = float(confusion.diagonal().sum() / confusion.sum())
-            result[f"iou_{suffix}"] = float(iou.nanmean())
-        result["pixels"], result["area"] = int(counts.sum()), float(areas.sum())
-        return {key: result[key] for key in (*_FIGURES, "pixels", "area")}
-
-    def _figures_by_class(self, counts: Tensor, areas: Tensor) -> list[dict[str, Any]]:
-        columns = {"class": list(range(self.num_classes))}
-        for suffix, confusion in (("img", counts), ("surf", areas)):
-            accuracy, iou = self._by_class(confusion)
-            columns[f"acc_{suffix}"], columns[f"iou_{suffix}"] = accuracy.tolist(), iou.tolist()
-        columns["pixels"] = counts.sum(1).to(torch.int64).tolist()
-        columns["area"] = areas.sum(1).tolist()
-        keys = ("class", *_FIGURES, "pixels", "area")
-        rows = zip(*(columns[key] for key in keys), strict=True)
-        return [dict(zip(keys, row, strict=True)) for row in rows]
-
-    def _by_class(self, confusion: Tensor) -> tuple[Tensor, Tensor]:
-        """Accuracy and IOU of every class, NaN where there is none."""
-        hits, labels = confusion.diagonal(), confusion.sum(1)
-        accuracy, iou = hits / labels, hits / (labels + confusion.sum(0) - hits)
-        if self.ignore_index is not None and 0 <= self.ignore_index < self.num_classes:
-            accuracy[self.ignore_index] = iou[self.ignore_index] = math.nan
-        return accuracy, iou
 
     def _settings(self) -> tuple[int, int | None, tuple[float, ...] | None]:
         return self.num_classes, self.ignore_index, self.depth_ranges
