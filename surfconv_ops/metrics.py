@@ -19,11 +19,11 @@ from .checks import (
     type_name,
     valid_depth,
 )
+from .figures import figures, figures_by_class
 
 #: Boundaries of the depth ranges that figures are also given for, in metres.
 DEPTH_RANGES = (0.0, 5.0, 10.0, 20.0, 40.0, math.inf)
 
-_FIGURES = ("acc_img", "iou_img", "acc_surf", "iou_surf")
 # Pixels looked at together, which bounds the memory an update works in.
 _CHUNK = 1 << 22
 # Squares of greater depths would leave float64.
@@ -63,8 +63,8 @@ class SegmentationMetrics:
         >>> metrics = SegmentationMetrics(num_classes=3)
         >>> target = torch.tensor([[[0, 1], [2, 2]]])
         >>> prediction = torch.tensor([[[1, 1], [2, 1]]])
-        >>> metrics.update(prediction, target, depth=torch.tensor([[[1.0, 1.0], [2.0, 0.0]]]))
-        >>> figures = metrics.compute()
+        >>> depth = torch.tensor([[[1.0, 1.0], [2.0, 0.0]]])
+        >>> figures = metrics.update(prediction, target, depth).compute()
         >>> round(figures["acc_img"], 4), figures["iou_img"], figures["acc_surf"]
         (0.6667, 0.5, 1.0)
     """
@@ -110,7 +110,7 @@ class SegmentationMetrics:
         prediction: Tensor | np.ndarray[Any, Any],
         target: Tensor | np.ndarray[Any, Any],
         depth: Tensor | np.ndarray[Any, Any],
-    ) -> None:
+    ) -> SegmentationMetrics:
         """Count one image or a batch; in whatever batches images come, the result is the same.
 
         Counts are exactly the same, areas to float64's rounding. A call that raises counts
@@ -125,6 +125,9 @@ class SegmentationMetrics:
         Shape:
             - prediction, target: ``(N, H, W)`` or ``(H, W)``
             - depth: the same, or ``(N, 1, H, W)``, ``(1, H, W)``
+
+        Returns:
+            This object.
 
         Raises:
             ValueError: An id is out of range, or shapes or devices differ.
@@ -158,6 +161,7 @@ class SegmentationMetrics:
             areas += more_areas
         self._counts += counts
         self._areas += areas
+        return self
 
     def _count(self, prediction: Tensor, target: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
         """Both stacks of confusion matrices, of flat maps."""
@@ -199,11 +203,14 @@ class SegmentationMetrics:
             f" {int(ids[refused][0])}"
         )
 
-    def merge(self, other: SegmentationMetrics) -> None:
+    def merge(self, other: SegmentationMetrics) -> SegmentationMetrics:
         """Count what ``other`` has counted as well; ``other`` stays as it is.
 
         Args:
             other: Metrics with the same classes, ignored class and depth ranges.
+
+        Returns:
+            This object.
 
         Raises:
             ValueError: The two were made with different arguments.
@@ -215,30 +222,46 @@ class SegmentationMetrics:
             raise ValueError(f"other: expected the arguments of {self!r}, got {other!r}")
         self._counts = self._counts + other._counts
         self._areas = self._areas + other._areas
+        return self
 
-    def all_reduce(self, group: torch.distributed.ProcessGroup | None = None) -> None:
+    def all_reduce(
+        self, group: torch.distributed.ProcessGroup | None = None
+    ) -> SegmentationMetrics:
         """Merge the metrics of all processes: each ends up with the figures of all.
 
-        Call it once, after the last update: a second call would count everything once more for
-        every process. Samplers that pad the data to a multiple of the processes, as
-        DistributedSampler does, repeat images, and these count twice.
+        To be called by every process of the group, once the last :meth:`update` is done: a second
+        call counts everything once more. Samplers that pad the data to a multiple of the
+        processes, as DistributedSampler does, repeat images, and these count twice. The matrices
+        travel as objects; with NCCL that takes ``torch.cuda.set_device`` beforehand.
 
         Args:
-            group: Process group; None for the default one.
+            group: Process group of torch.distributed; None for the default one.
+
+        Returns:
+            This object.
 
         Raises:
-            ValueError: The processes' metrics were made with different arguments.
-            RuntimeError: There is no process group.
+            ValueError: This process is not in the group, or the processes' metrics were made with
+                different arguments.
+            RuntimeError: torch.distributed is not initialised.
         """
-        if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
-            raise RuntimeError("all_reduce: torch.distributed has no process group here")
-        every: list[Any] = [None] * torch.distributed.get_world_size(group)
+        distributed = torch.distributed
+        if not (distributed.is_available() and distributed.is_initialized()):
+            raise RuntimeError(
+                "all_reduce: torch.distributed is not initialised; call"
+                " torch.distributed.init_process_group in every process first, or add up objects"
+                " of one process with merge"
+            )
+        if distributed.get_rank(group) < 0:
+            raise ValueError("group: this process is not a member of it")
+        parts: list[Any] = [None] * distributed.get_world_size(group)
         # Gathered, not reduced, so that all processes add in one order and get the same bits.
-        torch.distributed.all_gather_object(every, self, group)
-        total = SegmentationMetrics(*self._settings()[:2], depth_ranges=self.depth_ranges)
-        for each in every:
-            total.merge(each)
-        self._counts, self._areas = total._counts, total._areas
+        distributed.all_gather_object(parts, self, group)
+        whole = parts[0]
+        for part in parts[1:]:
+            whole.merge(part)
+        self._counts, self._areas = whole._counts, whole._areas
+        return self
 
     def compute(self) -> dict[str, Any]:
         """The figures of all pixels counted so far, as plain numbers, lists and dicts.
@@ -258,42 +281,14 @@ class SegmentationMetrics:
             nan
         """
         counts, areas = self._counts.to(torch.float64), self._areas
-        result: dict[str, Any] = self._figures(counts.sum(0), areas.sum(0))
-        result["classes"] = self._figures_by_class(counts.sum(0), areas.sum(0))
+        whole = counts.sum(0), areas.sum(0)
+        result: dict[str, Any] = figures(*whole, self.ignore_index)
+        result["classes"] = figures_by_class(*whole, self.ignore_index)
         result["ranges"] = [
-            {"from": low, "to": high, **self._figures(counts[i], areas[i])}
+            {"from": low, "to": high, **figures(counts[i], areas[i], self.ignore_index)}
             for i, (low, high) in enumerate(self._range_pairs())
         ]
         return result
-
-    def _figures(self, counts: Tensor, areas: Tensor) -> dict[str, Any]:
-        """The four figures of one pair of confusion matrices."""
-        result: dict[str, Any] = {}
-        for suffix, confusion in (("img", counts), ("surf", areas)):
-            _, iou = self._by_class(confusion)
-            result[f"acc_{suffix}"] = float(confusion.diagonal().sum() / confusion.sum())
-            result[f"iou_{suffix}"] = float(iou.nanmean())
-        result["pixels"], result["area"] = int(counts.sum()), float(areas.sum())
-        return {key: result[key] for key in (*_FIGURES, "pixels", "area")}
-
-    def _figures_by_class(self, counts: Tensor, areas: Tensor) -> list[dict[str, Any]]:
-        columns = {"class": list(range(self.num_classes))}
-        for suffix, confusion in (("img", counts), ("surf", areas)):
-            accuracy, iou = self._by_class(confusion)
-            columns[f"acc_{suffix}"], columns[f"iou_{suffix}"] = accuracy.tolist(), iou.tolist()
-        columns["pixels"] = counts.sum(1).to(torch.int64).tolist()
-        columns["area"] = areas.sum(1).tolist()
-        keys = ("class", *_FIGURES, "pixels", "area")
-        rows = zip(*(columns[key] for key in keys), strict=True)
-        return [dict(zip(keys, row, strict=True)) for row in rows]
-
-    def _by_class(self, confusion: Tensor) -> tuple[Tensor, Tensor]:
-        """Accuracy and IOU of every class, NaN where there is none."""
-        hits, labels = confusion.diagonal(), confusion.sum(1)
-        accuracy, iou = hits / labels, hits / (labels + confusion.sum(0) - hits)
-        if self.ignore_index is not None and 0 <= self.ignore_index < self.num_classes:
-            accuracy[self.ignore_index] = iou[self.ignore_index] = math.nan
-        return accuracy, iou
 
     def _settings(self) -> tuple[int, int | None, tuple[float, ...] | None]:
         return self.num_classes, self.ignore_index, self.depth_ranges
@@ -316,4 +311,5 @@ def _counts_well(device: torch.device) -> bool:
 
 
 def _to_tensor(map: Any) -> Any:
-    return torch.from_numpy(map) if isinstance(map, np.ndarray) else map
+    # Copied: an array may be read-only or run backwards, which tensors cannot.
+    return torch.from_numpy(map.copy()) if isinstance(map, np.ndarray) else map

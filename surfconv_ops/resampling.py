@@ -31,7 +31,7 @@ def axis_taps(positions: Tensor, size: int, reach: float = 1.0) -> AxisTaps:
     """
     positions = positions.clamp(0, size - 1)
     first = (positions - reach).floor().clamp(min=-1) + 1
-    count = min(math.ceil(2 * reach), size + 1)
+    count = min(math.ceil(2 * reach), size)
     pixels = first + torch.arange(count, dtype=torch.float64, device=positions.device)[:, None]
     weights = 1 - (pixels - positions).abs() / reach
     inside = (pixels >= 0) & (pixels < size)

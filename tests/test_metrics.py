@@ -46,9 +46,7 @@ def pixels_of(prediction: Tensor, target: Tensor, depth: Tensor) -> list[Pixel]:
 
 
 def counted(problem: tuple[Tensor, Tensor, Tensor], *arguments: Any, **options: Any) -> Any:
-    metrics = SegmentationMetrics(*arguments, **options)
-    metrics.update(*problem)
-    return metrics
+    return SegmentationMetrics(*arguments, **options).update(*problem)
 
 
 def assert_figures(actual: dict[str, Any], expected: dict[str, float], what: str) -> None:
@@ -264,6 +262,7 @@ def test_layouts_shapes_and_arrays() -> None:
         strided,
         (prediction, target, depth.unsqueeze(1)),
         (prediction.numpy(), target.numpy(), depth.numpy()),
+        tuple(map.flip(-1).numpy()[..., ::-1] for map in (prediction, target, depth)),
         (prediction, target, depth.clone().requires_grad_()),
     ]
     for maps in same:

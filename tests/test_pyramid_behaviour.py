@@ -45,16 +45,21 @@ def test_what_is_masked_is_not_seen(poison: float) -> None:
     assert torch.equal(actual[mask], expected[mask])
 
 
-@pytest.mark.parametrize("scale", [0.5, 2.0, 1.5, 7 / 3])
-def test_infinities_stay_where_they_are(scale: float) -> None:
-    """A pixel that is read alone passes as it is, and a neighbour of no weight is not seen."""
-    pyramid = SurfConvPyramid(nn.Identity(), DepthLevels([], [1.0]), scale)
+@pytest.mark.parametrize(
+    ("reference", "center", "step"),
+    [(1.0, 2.0, 1), (2.0, 1.0, 2), (3.0, 2.0, 3), (0.7, 0.3, 7), (0.1, 0.3, 1)],
+)
+def test_infinities_stay_where_they_are(reference: float, center: float, step: int) -> None:
+    """A pixel that is read alone passes as it is, and a neighbour of no weight is not seen.
+
+    0.1 / 0.3 is above 1/3 in float64: pixels meet in spite of it.
+    """
+    pyramid = SurfConvPyramid(nn.Identity(), DepthLevels([], [center]), reference)
     image = torch.full((1, 1, 15, 15), -math.inf)
     depth = torch.ones(1, 15, 15)
     assert (pyramid(image, depth) == -math.inf).all()
     image = torch.zeros(1, 1, 15, 15)
     image[..., 8, 8] = math.nan
-    step = {0.5: 1, 2.0: 2, 1.5: 3, 7 / 3: 7}[scale]
     met = pyramid(image, depth)[0, 0, ::step, ::step]
     alone = torch.zeros_like(met, dtype=torch.bool)
     if 8 % step == 0:
