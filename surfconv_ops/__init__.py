@@ -2,6 +2,7 @@
 
 from . import reference
 from .conversion import convert_conv2d
+from .convertible import conversion_report
 from .depth import at_output_centers, depth_to_scale
 from .functional import surf_conv2d
 from .guided import DepthGuided
@@ -16,6 +17,7 @@ __all__ = [
     "SurfConv2d",
     "__version__",
     "at_output_centers",
+    "conversion_report",
     "convert_conv2d",
     "depth_to_scale",
     "reference",
