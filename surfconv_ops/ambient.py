@@ -26,7 +26,7 @@ class _Resized(NamedTuple):
     height: int
     width: int
     dtype: torch.dtype
-    mode: tuple[bool, ...]
+    mode: tuple[bool, bool]
     depth: Tensor
 
 
@@ -93,8 +93,8 @@ class DepthCall:
     def _resize(self, height: int, width: int, dtype: torch.dtype) -> Tensor:
         tracing = torch.compiler.is_dynamo_compiling()
         # A map made without a graph, or in inference mode, is no use to a layer that wants one.
-        mode = (self.depth.requires_grad and torch.is_grad_enabled(),)
-        mode = mode if tracing else (*mode, torch.is_inference_mode_enabled())
+        with_graph = self.depth.requires_grad and torch.is_grad_enabled()
+        mode = with_graph, False if tracing else torch.is_inference_mode_enabled()
         for known in self._resized:
             if (
                 known.dtype == dtype

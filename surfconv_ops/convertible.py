@@ -61,10 +61,8 @@ class ConversionReport:
         return tuple(row for row in self.rows if row.now == _UNCHANGED)
 
     def __str__(self) -> str:
-        table = [
-            ("layer", "was", "now", "why"),
-            *(r._replace(name=r.name or ".") for r in self.rows),
-        ]
+        table = [ConversionRow("layer", "was", "now", "why"), *self.rows]
+        table = [line._replace(name=line.name or ".") for line in table]
         widths = [max(len(line[i]) for line in table) for i in range(4)]
         lines = ["  ".join(c.ljust(w) for c, w in zip(t, widths, strict=True)) for t in table]
         total = f"{len(self.converted)} layers take depth, {len(self.unchanged)} are unchanged"

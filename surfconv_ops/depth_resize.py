@@ -102,7 +102,7 @@ def _values_can_be_read(depth: Tensor) -> bool:
     """Whether a shape may depend on values: not in traces and captures, not under torch.func."""
     return not (
         torch.compiler.is_compiling()
-        or torch.jit.is_tracing()
+        or torch._C._get_tracing_state() is not None
         or depth.is_meta
         or torch._C._functorch.maybe_current_level() is not None
         or torch._C._len_torch_dispatch_stack() > 0
