@@ -106,7 +106,10 @@ class DepthGuided(nn.Module):
             elif call is not None:
                 ambient.eager_runner()(ambient.end_call, outer)
         if not torch.compiler.is_compiling():
-            ambient.eager_runner()(self._finish, call, outer)
+            message = ambient.eager_runner()(self._finish, call, outer)
+            if message is not None:
+                # Past the two functions of nn.Module that call this one.
+                warnings.warn(f"DepthGuided: {message}", UserWarning, stacklevel=4)
         return output
 
     def load_state_dict(
@@ -148,25 +151,23 @@ class DepthGuided(nn.Module):
         """
         return ambient.checkpoint_contexts()
 
-    def _finish(self, call: ambient.DepthCall, outer: ambient.DepthCall | None) -> None:
+    def _finish(self, call: ambient.DepthCall, outer: ambient.DepthCall | None) -> str | None:
         if outer is not None:
             outer.layers_run |= call.layers_run
-        self._warn_of_idle_layers(call.layers_run)
+        return self._message_of_idle_layers(call.layers_run)
 
-    def _warn_of_idle_layers(self, layers_run: set[nn.Module]) -> None:
+    def _message_of_idle_layers(self, layers_run: set[nn.Module]) -> str | None:
         takers = {n: m for n, m in self.module.named_modules() if isinstance(m, DepthLayer)}
         idle = frozenset(name for name, layer in takers.items() if layer not in layers_run)
         if (takers and not idle) or idle in self._warned_of:
-            return
+            return None
         self._warned_of.add(idle)
         if not takers:
-            message = "no layer inside takes depth; convert_conv2d puts SurfConv2d layers there"
-        else:
-            message = (
-                f"{len(idle)} of {len(takers)} layers that take depth did not run in this call:"
-                f" {', '.join(sorted(idle))}"
-            )
-        warnings.warn(f"DepthGuided: {message}", UserWarning, stacklevel=5)
+            return "no layer inside takes depth; convert_conv2d puts SurfConv2d layers there"
+        return (
+            f"{len(idle)} of {len(takers)} layers that take depth did not run in this call:"
+            f" {', '.join(sorted(idle))}"
+        )
 
 
 def _with_prefix(state_dict: Mapping[str, Any]) -> OrderedDict[str, Any]:
