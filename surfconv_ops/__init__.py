@@ -2,6 +2,7 @@
 
 from . import reference
 from .conversion import convert_conv2d
+from .convertible import conversion_report
 from .d4 import D4, fit_depth_levels
 from .depth import at_output_centers, depth_to_scale
 from .functional import surf_conv2d
@@ -22,6 +23,7 @@ __all__ = [
     "SurfConvPyramid",
     "__version__",
     "at_output_centers",
+    "conversion_report",
     "convert_conv2d",
     "depth_to_scale",
     "fit_depth_levels",

@@ -1,46 +1,85 @@
-"""The depth that belongs to the call that is running: what DepthGuided sets and layers read."""
+"""The depth of the call that is running: DepthGuided sets it, layers that were given none read it.
+
+In eager execution every thread has its own call, so that threads never see one another's. Dynamo
+cannot trace an assignment to a thread's attribute (2.13). While it traces, ``trace.call`` serves,
+which is never anything but None when a program really runs.
+"""
 
 from __future__ import annotations
 
+import sys
 import threading
-from typing import Any
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.fx.experimental.symbolic_shapes import statically_known_true
 
 from .checks import check_depth_tensor
 from .depth_resize import resize_depth
 
 
+class _Resized(NamedTuple):
+    """A map and what it was made for."""
+
+    height: int
+    width: int
+    dtype: torch.dtype
+    mode: tuple[bool, bool]
+    depth: Tensor
+
+
 class DepthCall:
-    """One call of DepthGuided: its depth, that depth at every resolution asked for so far.
+    """One call of DepthGuided: its depth, at every resolution that a layer has asked for.
 
     Args:
-        depth: ``(N, H, W)``, ``(N, 1, H, W)``, or ``(H, W)``, in metres.
+        depth: Metres: ``(N, H, W)``, ``(N, 1, H, W)``, or ``(H, W)``.
         module: The module called, in which layers have their names.
     """
 
     def __init__(self, depth: Tensor, module: nn.Module) -> None:
         self.depth = _as_maps(depth)
         self.module = module
-        self.ran: set[nn.Module] = set()
-        # A compiler inside the call leaves no trace of which layers ran.
-        self.compiled = False
-        self.task = -1 if torch.compiler.is_dynamo_compiling() else _backward_task()
-        self._resized: list[tuple[int, int, tuple[Any, ...], Tensor]] = []
+        self.layers_run: set[nn.Module] = set()
+        self._resized: list[_Resized] = []
+        self._backward_pass = -1
+        self._functorch_level: int | None = None
 
-    def at(self, layer: nn.Module, input: Tensor) -> Tensor:
-        """The depth at the resolution of a layer's input, of the rank that fits it."""
+    def begin(self) -> DepthCall | None:
+        """Make this the call that is running; returns the one before, which is to be put back."""
+        self._backward_pass = _backward_pass()
+        self._functorch_level = _functorch_level()
+        before, _thread.call = _thread.call, self
+        return before
+
+    def for_recomputation(self) -> DepthCall:
+        """The same call as it stands now, to be taken up by a backward pass."""
+        call = DepthCall(self.depth, self.module)
+        call._resized = list(self._resized)
+        return call
+
+    def check_backward_pass(self, layer: nn.Module) -> None:
+        """A backward pass that began within this call may recompute layers of another."""
+        if self._backward_pass != _backward_pass():
+            raise RuntimeError(
+                f"depth: {self._name(layer)} was run by a backward pass, probably to recompute a"
+                " checkpoint, and the depth at hand may be another call's; put the checkpoint"
+                " around the DepthGuided, or give it"
+                " context_fn=surfconv_ops.DepthGuided.checkpoint_contexts"
+            )
+
+    def depth_for(self, layer: nn.Module, input: Tensor) -> Tensor:
+        """The depth at the resolution of a layer's input, ``(N, h, w)`` or ``(h, w)``."""
         if not isinstance(input, Tensor) or input.ndim not in (3, 4):
             # The layer's own message says what is wrong with such an input.
             return self.depth
-        batch = input.shape[0] if input.ndim == 4 else 1
-        if batch != self.depth.shape[0]:
+        images = input.shape[0] if input.ndim == 4 else 1
+        if images != self.depth.shape[0]:
             raise ValueError(
-                f"depth: layer {self._name(layer)} has input {tuple(input.shape)}, {batch} images,"
-                f" and the call has depth {tuple(self.depth.shape)}, {self.depth.shape[0]} maps;"
-                " DepthGuided serves nets whose layers keep the batch as it comes in"
+                f"depth: expected as many maps as layer {self._name(layer)} has images in its"
+                f" input {tuple(input.shape)}, got {tuple(self.depth.shape)}; a layer that has"
+                " time, views or patches in the batch needs its depth by hand: layer(input, depth)"
             )
         if input.device != self.depth.device:
             raise ValueError(
@@ -48,25 +87,35 @@ class DepthCall:
                 f" {self._name(layer)}, got {self.depth.device}"
             )
         dtype = torch.float64 if input.dtype == torch.float64 else torch.float32
-        resized = self._resize(input.shape[-2], input.shape[-1], dtype)
-        return resized if input.ndim == 4 else resized[0]
+        depth = self._resize(input.shape[-2], input.shape[-1], dtype)
+        return depth if input.ndim == 4 else depth[0]
 
     def _resize(self, height: int, width: int, dtype: torch.dtype) -> Tensor:
-        depth = self.depth
-        # A map made without a graph is no use to a layer that wants one.
-        kind = (dtype, torch.is_grad_enabled() and depth.requires_grad)
-        for h, w, known_kind, known in self._resized:
-            if known_kind == kind and _same(h, height) and _same(w, width):
-                return known
-        depth = depth.to(dtype)
-        if not (_same(height, depth.shape[-2]) and _same(width, depth.shape[-1])):
+        tracing = torch.compiler.is_dynamo_compiling()
+        # A map made without a graph, or in inference mode, is no use to a layer that wants one.
+        with_graph = self.depth.requires_grad and torch.is_grad_enabled()
+        mode = with_graph, False if tracing else torch.is_inference_mode_enabled()
+        for known in self._resized:
+            if (
+                known.dtype == dtype
+                and known.mode == mode
+                and _same(known.height, height)
+                and _same(known.width, width)
+            ):
+                return known.depth
+        depth = self.depth.to(dtype)
+        if not (_same(depth.shape[-2], height) and _same(depth.shape[-1], width)):
             depth = resize_depth(depth, height, width)
-        self._resized.append((height, width, kind, depth))
+        # What is made inside a transform of the net's own must not outlive it.
+        if tracing or _functorch_level() == self._functorch_level:
+            self._resized.append(_Resized(height, width, dtype, mode, depth))
         return depth
 
     def _name(self, layer: nn.Module) -> str:
-        names = [name for name, module in self.module.named_modules() if module is layer]
-        return f"'{names[0]}' ({type(layer).__name__})" if names else type(layer).__name__
+        for name, module in self.module.named_modules():
+            if module is layer and name:
+                return f"'{name}' ({type(layer).__name__})"
+        return type(layer).__name__
 
 
 class _ThreadState(threading.local):
@@ -77,67 +126,93 @@ class _TraceState:
     call: DepthCall | None = None
 
 
-# Dynamo cannot trace an assignment to a thread's own attribute, and traces one thread at a time.
+class _Eager:
+    #: Calls a function; hidden from compilers as soon as there is one.
+    run: Callable[..., Any] = staticmethod(lambda function, *args: function(*args))
+    is_hidden = False
+
+
 _thread = _ThreadState()
-_trace = _TraceState()
+_eager = _Eager()
+trace = _TraceState()
 
 
-def current_call() -> DepthCall | None:
-    """The innermost call that is running in this thread."""
-    if torch.compiler.is_dynamo_compiling() and _trace.call is not None:
-        return _trace.call
-    return _thread.call
+def eager_runner() -> Callable[..., Any]:
+    """What calls a function so that no compiler looks into it, as ``runner(function, *args)``.
+
+    Importing the compiler, which takes seconds, is left to whoever compiles.
+    """
+    if not _eager.is_hidden and "torch._dynamo" in sys.modules:
+        reason = "compile the DepthGuided, not the net inside it"
+        _eager.run = torch.compiler.disable(_eager.run, reason=reason)
+        _eager.is_hidden = True
+    return _eager.run
 
 
-def exchange_call(call: DepthCall | None) -> DepthCall | None:
-    """Make ``call`` the one that is running; returns the one before it, to be put back."""
-    if torch.compiler.is_dynamo_compiling():
-        before = _trace.call
-        _trace.call = call
-    else:
-        before = _thread.call
-        _thread.call = call
-    return before
+def end_call(before: DepthCall | None) -> None:
+    """Put back what :meth:`DepthCall.begin` returned."""
+    _thread.call = before
 
 
-def depth_of_call(layer: nn.Module, input: Tensor) -> Tensor:
-    """The depth that the running call has for a layer that was given none."""
-    call = current_call()
-    if call is None:
+def ambient_depth(layer: nn.Module, input: Tensor, depth: Tensor | None) -> Tensor:
+    """``depth``, or if that is None, what the running call has for a layer's input."""
+    if torch.compiler.is_dynamo_compiling() and trace.call is not None:
+        return depth if depth is not None else trace.call.depth_for(layer, input)
+    if _thread.call is not None:
+        # Where a compiler traces this, the call began outside, and is another one next time.
+        resolved: Tensor = _eager.run(_look_up, layer, input, depth)
+        return resolved
+    if depth is None:
         raise ValueError(
             f"depth: {type(layer).__name__} needs the depth of its input, got None; call"
-            " layer(input, depth) with metres at the input's resolution, or wrap the net in"
+            " layer(input, depth) with metres at the input's resolution, or wrap the whole net in"
             " surfconv_ops.DepthGuided and call that with depth=..."
         )
-    if not torch.compiler.is_dynamo_compiling() and call.task != _backward_task():
-        raise RuntimeError(
-            f"depth: {call._name(layer)} is run by a backward pass, to recompute a checkpoint of"
-            " another call than the one whose depth is at hand; put the checkpoint around the"
-            " DepthGuided, not inside it"
-        )
-    return call.at(layer, input)
+    return depth
 
 
-def note_layer(layer: nn.Module) -> None:
-    """Remember that a layer ran in the running call, if there is one."""
-    call = current_call()
-    if call is None:
-        return
-    if torch.compiler.is_dynamo_compiling():
-        call.compiled = True
-    else:
-        call.ran.add(layer)
+def _look_up(layer: nn.Module, input: Tensor, depth: Tensor | None) -> Tensor:
+    call = _thread.call
+    assert call is not None
+    call.layers_run.add(layer)
+    if depth is not None:
+        return depth
+    call.check_backward_pass(layer)
+    return call.depth_for(layer, input)
 
 
-def _backward_task() -> int:
-    """Which backward pass this thread is running a part of; -1 for none."""
-    task: int = torch._C._current_graph_task_id()
-    return task
+def checkpoint_contexts() -> tuple[AbstractContextManager[None], AbstractContextManager[None]]:
+    """See :meth:`surfconv_ops.DepthGuided.checkpoint_contexts`."""
+    call = _thread.call
+    return nullcontext(), nullcontext() if call is None else _resume(call.for_recomputation())
+
+
+@contextmanager
+def _resume(call: DepthCall) -> Iterator[None]:
+    before = call.begin()
+    try:
+        yield
+    finally:
+        end_call(before)
+
+
+def _backward_pass() -> int:
+    """Which backward pass this thread is working on; -1 for none."""
+    number: int = torch._C._current_graph_task_id()
+    return number
+
+
+def _functorch_level() -> int | None:
+    level: int | None = torch._C._functorch.maybe_current_level()
+    return level
 
 
 def _same(size: int, other: int) -> bool:
     if torch.compiler.is_compiling():
-        # A comparison of its own would tie the program to sizes that happen to be equal.
+        # A plain comparison would tie the program to sizes that happen to be equal. The import
+        # is slow, and the compiler has made it.
+        from torch.fx.experimental.symbolic_shapes import statically_known_true
+
         known: bool = statically_known_true(size == other)
         return known
     return size == other

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from .ambient import depth_of_call, note_layer
+from .ambient import ambient_depth
 from .checks import check_depth_tensor, check_not_negative, type_name, valid_depth
 from .depth import (
     check_levels,
@@ -81,10 +81,7 @@ class DepthLayer(nn.Module):
 
     def _resolve_depth(self, input: Tensor, depth: Tensor | None) -> Tensor:
         """The depth this call works with: ``(N, H, W)`` or ``(H, W)``, in its compute dtype."""
-        note_layer(self)
-        if depth is None:
-            depth = depth_of_call(self, input)
-        return _match_depth(depth, input)
+        return _match_depth(ambient_depth(self, input, depth), input)
 
     def _scale(self, depth: Tensor, window: Window) -> Tensor:
         """Scale of every output pixel, from the depth at its centre."""
@@ -112,7 +109,11 @@ class DepthLayer(nn.Module):
 
     def extra_repr(self) -> str:
         """The nn layer's description, followed by the depth options that are in use."""
-        parts = [super().extra_repr(), f"reference_depth={self.reference_depth}"]
+        return ", ".join([super().extra_repr(), self.describe_options()])
+
+    def describe_options(self) -> str:
+        """The depth options that are in use."""
+        parts = [f"reference_depth={self.reference_depth}"]
         if self.levels is not None:
             parts.append(f"levels={len(self.levels)}")
         if self.depth_window is not None:

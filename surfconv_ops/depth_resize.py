@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -18,8 +21,6 @@ def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
     result is invalid only where the whole footprint is. Depths are picked, never mixed, so that no
     surface appears between two others. Gradients flow to the pixels picked.
 
-    Time and memory are in proportion to the larger of the two sizes, whatever their ratio.
-
     Args:
         depth: Metres, floating point.
         height: Rows wanted; more than there are repeats rows.
@@ -33,46 +34,77 @@ def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
         - output: ``(N, height, width)``
     """
     H, W = depth.shape[-2], depth.shape[-1]
-    top, bottom, tall = _footprints(H, height, depth.device)
-    left, right, wide = _footprints(W, width, depth.device)
-
-    # The nearest valid pixel of one row is its first, because the pixel picked is the leftmost.
-    # So each row is reduced to that one column, and then the rows compete.
-    columns = torch.arange(W, device=depth.device)
-    column_or_none = torch.where(valid_depth(depth.detach()), columns, W)
-    first = _gather_windows(column_or_none, left, wide, -1).amin(-2)
-    first = torch.where(first < right, first, W)
-    aside = torch.where(first < W, (first - left).square(), (H + W) ** 2)
-
-    steps = torch.arange(tall, device=depth.device)
-    rows = top[:, None] + steps
-    distance = _gather_windows(aside, top, tall, -2) + steps.square()[:, None]
-    # One number orders by distance, then by row; a row beyond the footprint loses to all.
-    rank = torch.where((rows < bottom[:, None])[..., None], distance, 2 * (H + W) ** 2)
-    best = (rank * tall + steps[:, None]).amin(-2)
-    found = best < (H + W) ** 2 * tall
-    row = top[:, None] + torch.where(found, best % tall, 0)
-    column = torch.where(found, first.gather(-2, row), left)
-    picked = depth.flatten(-2).gather(-1, (row * W + column).flatten(-2))
-    return picked.unflatten(-1, (height, width))
+    rows, columns = _axis(H, height, depth.device), _axis(W, width, depth.device)
+    if _values_can_be_read(depth):
+        # Most pixels are no holes, and only holes need a search.
+        picked = depth.index_select(-2, rows.first).index_select(-1, columns.first)
+        if rows.largest == columns.largest == 1:
+            return picked
+        holes = (~valid_depth(picked.detach())).nonzero(as_tuple=True)
+        if not len(holes[0]):
+            return picked
+        nearest = _nearest_valid(depth, rows, columns, *holes)
+        return picked.index_put(holes, depth.reshape(-1)[nearest])
+    image = torch.arange(depth.shape[0], device=depth.device)[:, None, None]
+    row = torch.arange(height, device=depth.device)[:, None]
+    nearest = _nearest_valid(
+        depth, rows, columns, image, row, torch.arange(width, device=depth.device)
+    )
+    return depth.reshape(-1)[nearest]
 
 
-def _footprints(size: int, wanted: int, device: torch.device) -> tuple[Tensor, Tensor, int]:
-    """First pixel of each footprint, the pixel after its last, and the size of the largest."""
+class _Axis(NamedTuple):
+    """The footprints along one axis."""
+
+    first: Tensor
+    size: Tensor
+    #: No footprint is larger.
+    largest: int
+    #: All footprints are as large.
+    even: bool
+
+
+def _axis(size: int, wanted: int, device: torch.device) -> _Axis:
     pixels = torch.arange(wanted, device=device)
     first = torch.div(pixels * size, wanted, rounding_mode="floor")
     end = torch.div((pixels + 1) * size + wanted - 1, wanted, rounding_mode="floor")
-    return first, end, (size + 2 * wanted - 2) // wanted
+    # Without the greatest common divisor, a size can stay a symbol.
+    step = 1 if torch.compiler.is_compiling() else math.gcd(size, wanted)
+    return _Axis(first, end - first, -((step - size - wanted) // wanted), step in (size, wanted))
 
 
-def _gather_windows(map: Tensor, first: Tensor, size: int, dim: int) -> Tensor:
-    """Windows of ``size`` pixels along ``dim``, in a dimension of their own beside it.
+def _nearest_valid(
+    depth: Tensor, rows: _Axis, columns: _Axis, image: Tensor, row: Tensor, column: Tensor
+) -> Tensor:
+    """Where the valid depth nearest to each pixel's first is; its first where there is none."""
+    H, W = depth.shape[-2], depth.shape[-1]
+    start = (image * H + rows.first[row]) * W + columns.first[column]
+    tall, wide = rows.largest, columns.largest
+    # In the order of preference: a stable sort leaves ties by row, then by column. Places come
+    # first, and in int32, so that the search for the least runs over whole vectors.
+    place = torch.arange(tall * wide, device=depth.device)
+    distance = (place // wide).square() + (place % wide).square()
+    place = distance.argsort(stable=True)
+    offset = place // wide * W + place % wide
+    column_of = [-1, *[1] * start.ndim]
+    at = start + offset.view(column_of)
+    if not (rows.even and columns.even):
+        down, aside = (place // wide).view(column_of), (place % wide).view(column_of)
+        inside = (down < rows.size[row]) & (aside < columns.size[column])
+        at = torch.where(inside, at, start)
+    rank = torch.arange(tall * wide, dtype=torch.int32, device=depth.device).view(column_of)
+    usable = valid_depth(depth.detach().reshape(-1)[at])
+    best = torch.where(usable, rank, torch.iinfo(torch.int32).max).amin(0)
+    return start + offset[torch.where(best < tall * wide, best, 0)]
 
-    Along the last dimension ``(..., size, windows)``, along the one before it
-    ``(..., windows, size, W)``: either way the sum over windows runs over whole vectors. Pixels
-    beyond the end repeat the last.
-    """
-    steps = torch.arange(size, device=map.device)
-    at = steps[:, None] + first if dim == -1 else first[:, None] + steps
-    windows = map.index_select(dim, at.clamp(max=map.shape[dim] - 1).flatten())
-    return windows.unflatten(dim, at.shape)
+
+def _values_can_be_read(depth: Tensor) -> bool:
+    """Whether a shape may depend on values: not in traces and captures, not under torch.func."""
+    return not (
+        torch.compiler.is_compiling()
+        or torch._C._get_tracing_state() is not None
+        or depth.is_meta
+        or torch._C._functorch.maybe_current_level() is not None
+        or torch._C._len_torch_dispatch_stack() > 0
+        or (depth.is_cuda and torch.cuda.is_current_stream_capturing())
+    )
