@@ -16,8 +16,10 @@ BIN = 2.0**-12
 few_levels = pytest.mark.filterwarnings("ignore:depth levels. asked for")
 
 coarse = st.integers(1, 12).map(float)
+# Several to a bin: 5 m lies in bins of 2**-10 m.
+close = st.integers(0, 40).map(lambda i: 5.0 + i * 2.0**-12)
 metres = st.floats(2.0**-10, 2.0**10, width=32)
-depth_lists = st.lists(st.one_of(coarse, metres, st.sampled_from(INVALID)), max_size=40)
+depth_lists = st.lists(st.one_of(coarse, close, metres, st.sampled_from(INVALID)), max_size=40)
 some_valid = st.tuples(depth_lists, metres).map(lambda parts: [*parts[0], parts[1]])
 level_counts = st.integers(1, 9)
 whole_gammas = st.integers(-3, 4)

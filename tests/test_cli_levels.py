@@ -172,10 +172,15 @@ def test_pictures_of_odd_data(run: Run, tmp_path: Path, image: np.ndarray, name:
 
 
 def test_far_pixels_do_not_squeeze_the_picture(drawn: list[Figure], run: Run) -> None:
+    from matplotlib.patches import StepPatch
+
     np.save("depth.npy", np.append(np.random.default_rng(0).uniform(1.0, 4.0, 9999), 5000.0))
     run("depth.npy", "--unit", 1, "--gamma", 0)
     (panel,) = drawn[0].axes
     assert panel.get_xlim()[1] < 10
+    last = [patch for patch in panel.patches if isinstance(patch, StepPatch)][-1].get_data()
+    # One of 10,000 pixels is out of the picture, so not in its last bar either.
+    assert last.values[-1] == 0
     assert "0.01 % of the pixels lie beyond" in panel.get_xlabel()
 
 

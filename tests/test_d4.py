@@ -117,6 +117,11 @@ def test_one_depth_with_more_than_its_share() -> None:
     with pytest.warns(UserWarning, match=r"65\.535 m alone, 50\.0% of the valid .*saturated"):
         levels = fit_depth_levels(depth, 4, 0.0)
     assert levels.edges == (2.0, 4.0)
+    # Fewer depths than levels, and still fewer levels than depths.
+    near = torch.tensor([1.0] * 20 + [2.0, 3.0, 4.0])
+    with pytest.warns(UserWarning, match=r"asked for 6, made 2, because 1 m alone, 87\.0%"):
+        levels = fit_depth_levels(near, 6, 0.0)
+    assert levels == DepthLevels((1.0,), (1.0, 3.0), 0.0)
 
 
 @pytest.mark.parametrize("limit", [5, 2**17])
