@@ -106,10 +106,18 @@ class DepthCall:
         depth = self.depth.to(dtype)
         if not (_same(depth.shape[-2], height) and _same(depth.shape[-1], width)):
             depth = resize_depth(depth, height, width)
-        # What is made inside a transform of the net's own must not outlive it.
-        if tracing or _functorch_level() == self._functorch_level:
+        if self._may_keep(tracing):
             self._resized.append(_Resized(height, width, dtype, mode, depth))
         return depth
+
+    def _may_keep(self, tracing: bool) -> bool:
+        """Whether what is made here can be used elsewhere in the call."""
+        if tracing:
+            # In a graph for training this may be a checkpoint's part, which nothing may leave;
+            # the compiler itself removes what is computed twice there.
+            return torch.compiler.is_exporting() or not torch.is_grad_enabled()
+        # What is made inside a transform of the net's own ends with it.
+        return _functorch_level() == self._functorch_level
 
     def _name(self, layer: nn.Module) -> str:
         for name, module in self.module.named_modules():
@@ -123,7 +131,10 @@ class _ThreadState(threading.local):
 
 
 class _TraceState:
-    call: DepthCall | None = None
+    def __init__(self) -> None:
+        # Not the class's attribute: that the object has one of its own is part of what compiled
+        # code is guarded by.
+        self.call: DepthCall | None = None
 
 
 class _Eager:

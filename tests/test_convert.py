@@ -322,11 +322,11 @@ def test_module_argument() -> None:
 
 
 TABLE = """\
-layer  was                           now                                      why
+layer  was                           now                                        why
 0      Conv2d(3, 8, 7 x 7)           SurfConv2d(reference_depth=2.0, levels=3)
-1      MaxPool2d(3 x 3)              unchanged                                convert_conv2d changes pools with pools=True only
-2      Conv2d(8, 4, 1 x 1)           unchanged                                its 1 x 1 window reaches no neighbour
-3      ConvTranspose2d(4, 2, 2 x 2)  unchanged                                only nn.Conv2d, nn.MaxPool2d and nn.AvgPool2d have a counterpart
+1      MaxPool2d(3 x 3)              unchanged                                  convert_conv2d changes pools with pools=True only
+2      Conv2d(8, 4, 1 x 1)           unchanged                                  its 1 x 1 window reaches no neighbour
+3      ConvTranspose2d(4, 2, 2 x 2)  unchanged                                  only nn.Conv2d, nn.MaxPool2d and nn.AvgPool2d have a counterpart
 1 layers take depth, 3 are unchanged"""  # noqa: E501
 
 
