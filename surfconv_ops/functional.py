@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from . import ops
 from .autocast import cast_to_autocast_dtype
 from .checks import PaddingArgument, PairArgument
-from .ops import SurfConv2dFunction
 from .validation import check_surf_conv2d
 
 
@@ -92,5 +92,5 @@ def surf_conv2d(
     arguments, batched = check_surf_conv2d(
         input, weight, bias, scale, guide, guide_tolerance, stride, padding, dilation, groups
     )
-    output: Tensor = SurfConv2dFunction.apply(*arguments)
+    output = ops.surf_conv2d(*arguments)
     return output if batched else output.squeeze(0)
