@@ -220,7 +220,8 @@ class DepthToScaleBackwardFunction(torch.autograd.Function):
     def jvp(ctx: Any, grad_tangent: Tensor, depth_tangent: Tensor, *_: Any) -> Tensor:
         grad, depth = ctx.saved_tensors
         first, second = _slopes(depth, *ctx.numbers)
-        return grad_tangent * first + depth_tangent * grad * second
+        tangent: Tensor = grad_tangent * first + depth_tangent * grad * second
+        return tangent
 
     @staticmethod
     def vmap(

@@ -22,6 +22,8 @@ _below_autograd: Callable[[], AbstractContextManager[Any]] = getattr(
 
 def has_tangent(args: tuple[Any, ...]) -> bool:
     """Whether forward-mode differentiation is under way for one of ``args``."""
+    if getattr(forward_ad, "_current_level", 0) < 0:
+        return False
     return any(
         isinstance(arg, Tensor) and forward_ad.unpack_dual(arg).tangent is not None for arg in args
     )
