@@ -289,7 +289,8 @@ class SurfConv2d(DepthLayer, nn.Conv2d):
             self.padding,  # type: ignore[arg-type]
             self.dilation,
         )
-        guide, tolerance = self._guide(depth)
+        # With a single tap there is no other point to see.
+        guide, tolerance = (None, 0.0) if window.kernel == (1, 1) else self._guide(depth)
         return convolve(
             input,
             self.weight,
