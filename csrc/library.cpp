@@ -2,6 +2,7 @@
 // ones. Full error messages live in the Python validator that every backend shares.
 #include <torch/csrc/stable/library.h>
 
+#include "depth_to_scale.h"
 #include "level_values.h"
 #include "surf_conv2d.h"
 
@@ -15,6 +16,12 @@ STABLE_TORCH_LIBRARY(surfconv, m) {
       "int groups, bool need_input, bool need_weight, bool need_bias, bool need_scale) "
       "-> (Tensor, Tensor, Tensor, Tensor)");
   m.def("level_values(Tensor depth, Tensor edges, Tensor values) -> Tensor");
+  m.def(
+      "depth_to_scale(Tensor depth, float reference_depth, float invalid, float low, float high, "
+      "float steepest) -> Tensor");
+  m.def(
+      "depth_to_scale_backward(Tensor grad, Tensor depth, float reference_depth, float low, "
+      "float high, float steepest) -> Tensor");
   m.def("cpu_capability() -> str");
 }
 
@@ -22,6 +29,8 @@ STABLE_TORCH_LIBRARY_IMPL(surfconv, CPU, m) {
   m.impl("surf_conv2d", TORCH_BOX(&surfconv::surf_conv2d));
   m.impl("surf_conv2d_backward", TORCH_BOX(&surfconv::surf_conv2d_backward));
   m.impl("level_values", TORCH_BOX(&surfconv::level_values));
+  m.impl("depth_to_scale", TORCH_BOX(&surfconv::depth_to_scale));
+  m.impl("depth_to_scale_backward", TORCH_BOX(&surfconv::depth_to_scale_backward));
 }
 
 STABLE_TORCH_LIBRARY_IMPL(surfconv, CompositeExplicitAutograd, m) {

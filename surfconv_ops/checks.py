@@ -34,6 +34,11 @@ def check_integer(value: Any, name: str, minimum: int) -> int:
 
 def check_pair(value: Any, name: str, minimum: int) -> Pair:
     """An integer or a (y, x) pair of integers, each of at least ``minimum``."""
+    # A module's own attributes, checked in every call.
+    if type(value) is tuple and len(value) == 2 and type(value[0]) is type(value[1]) is int:
+        y, x = value
+        if y >= minimum and x >= minimum:
+            return y, x
     if isinstance(value, int):
         single = check_integer(value, name, minimum)
         return single, single

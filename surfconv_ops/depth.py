@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,6 +20,7 @@ from .checks import (
     check_positive_pair,
     valid_depth,
 )
+from .depth_ops import ScaleRule, scale_of
 from .geometry import FloatPair
 from .levels import DepthLevels
 from .validation import Window, check_window
@@ -93,48 +94,25 @@ def depth_to_scale(
         )
     dtype = torch.float64 if depth.dtype == torch.float64 else torch.float32
     references = reference if isinstance(reference, tuple) else (reference,)
-    limits = ScaleLimits(invalid_scale, min_scale, min(max_scale, torch.finfo(dtype).max))
+    rule = ScaleRule(
+        invalid_scale,
+        min_scale,
+        min(max_scale, torch.finfo(dtype).max),
+        torch.finfo(depth.dtype).max,
+    )
     if levels is not None:
-        scales = [_of_levels(r, levels, depth, limits) for r in references]
-    elif depth.requires_grad and torch.is_grad_enabled():
-        scales = [_differentiable(r, depth.to(dtype), depth.dtype, limits) for r in references]
+        scales = [_of_levels(r, levels, depth, rule) for r in references]
     else:
-        scales = [_of_depth(r, depth.to(dtype), limits) for r in references]
+        scales = [scale_of(depth.to(dtype), r, rule) for r in references]
     if min_scale > 0 or max_scale < math.inf:
-        _warn_of_clamping(references, depth, levels, limits)
+        _warn_of_clamping(references, depth, levels, rule)
     return torch.stack(scales, -3) if isinstance(reference, tuple) else scales[0]
 
 
-class ScaleLimits(NamedTuple):
-    """What becomes of scales that depth does not give, or not within bounds."""
-
-    invalid: float
-    low: float
-    high: float
-
-
-def _of_depth(reference: float, metres: Tensor, limits: ScaleLimits) -> Tensor:
-    scale = (reference / metres).clamp(limits.low, limits.high)
-    return torch.where(valid_depth(metres), scale, limits.invalid)
-
-
-def _of_levels(reference: float, levels: DepthLevels, depth: Tensor, limits: ScaleLimits) -> Tensor:
+def _of_levels(reference: float, levels: DepthLevels, depth: Tensor, rule: ScaleRule) -> Tensor:
     """One scale per level, computed once for each and looked up by every pixel."""
-    scales = [min(max(reference / c, limits.low), limits.high) for c in levels.centers]
-    return levels.look_up(depth, scales, limits.invalid)
-
-
-def _differentiable(
-    reference: float, metres: Tensor, depth_dtype: torch.dtype, limits: ScaleLimits
-) -> Tensor:
-    """The same as :func:`_of_depth`, constant wherever its derivative is not to flow."""
-    constant = _of_depth(reference, metres.detach(), limits)
-    safe = torch.where(valid_depth(metres), metres, 1.0)
-    wanted = (reference / safe).detach()
-    # The derivative also has to fit the depth's own dtype, which may be a half type.
-    steep = wanted / safe.detach() > torch.finfo(depth_dtype).max
-    flows = valid_depth(metres) & (wanted >= limits.low) & (wanted <= limits.high) & ~steep
-    return torch.where(flows, reference / torch.where(flows, metres, 1.0), constant)
+    scales = [min(max(reference / c, rule.low), rule.high) for c in levels.centers]
+    return levels.look_up(depth, scales, rule.invalid)
 
 
 def at_output_centers(
@@ -182,11 +160,33 @@ def at_output_centers(
         raise ValueError(f"map: expected (N, H, W), (N, K, H, W) or (H, W), got {tuple(map.shape)}")
     size = (map.shape[-2], map.shape[-1])
     window = check_window(size, kernel_size, stride, padding, dilation, size_name="map")
-    return read_at_centers(map, window)
+    return _select_centers(map, window)
 
 
 def read_at_centers(map: Tensor, window: Window) -> Tensor:
-    """:func:`at_output_centers` with a checked window."""
+    """:func:`at_output_centers` with a checked window; the map itself where that is all of it.
+
+    Copies nothing where every centre lies on a pixel: such a result shares the map's memory.
+    """
+    # Sizes that a compiler keeps symbolic would turn into conditions on them.
+    if torch.compiler.is_compiling():
+        return _select_centers(map, window)
+    parts = []
+    for i in (0, 1):
+        first = geometry.first_centre_pixel(
+            window.kernel[i], window.padding_before[i], window.dilation[i]
+        )
+        end = first + (window.output[i] - 1) * window.stride[i] + 1
+        if first < 0 or end > map.shape[i - 2]:
+            return _select_centers(map, window)
+        parts.append(slice(first, end, window.stride[i]))
+    rows, columns = parts
+    if window.stride == (1, 1) and window.output == tuple(map.shape[-2:]):
+        return map
+    return map[..., rows, columns]
+
+
+def _select_centers(map: Tensor, window: Window) -> Tensor:
     for i in (0, 1):
         pixels = geometry.centre_pixels(
             window.output[i],
@@ -228,7 +228,7 @@ def _warn_of_clamping(
     references: tuple[float, ...],
     depth: Tensor,
     levels: DepthLevels | None,
-    limits: ScaleLimits,
+    limits: ScaleRule,
 ) -> None:
     global _warned_of_clamping
     if _warned_of_clamping or torch.compiler.is_compiling():

@@ -85,6 +85,13 @@ class DepthLayer(nn.Module):
 
     def _scale(self, depth: Tensor, window: Window) -> Tensor:
         """Scale of every output pixel, from the depth at its centre."""
+        # A single tap stays at the centre: its scale changes nothing, nor is it worth computing
+        # where nobody asks for the depth's gradient, which is zero.
+        if window.kernel == (1, 1) and not (depth.requires_grad and torch.is_grad_enabled()):
+            shape = (*depth.shape[:-2], 1, *window.output)
+            if torch.compiler.is_compiling():
+                return depth.new_ones(shape)
+            return depth.new_ones(1).expand(shape)
         if not isinstance(self.reference_depth, tuple):
             # The scale's channel, made here rather than later: TorchInductor 2.13 fails on dynamic
             # sizes where a view of a computed map goes into an operator.

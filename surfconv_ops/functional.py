@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from . import ops
 from .autocast import cast_to_autocast_dtype
 from .checks import PaddingArgument, PairArgument
-from .ops import SurfConv2dFunction
-from .validation import check_surf_conv2d
+from .validation import Window, check_surf_conv2d
 
 
 def surf_conv2d(
@@ -88,9 +88,38 @@ def surf_conv2d(
         >>> surf_conv2d(x, weight, scale=scale, padding=1).shape
         torch.Size([2, 8, 16, 16])
     """
-    input, weight, bias = cast_to_autocast_dtype(input, weight, bias)
-    arguments, batched = check_surf_conv2d(
+    return convolve(
         input, weight, bias, scale, guide, guide_tolerance, stride, padding, dilation, groups
     )
-    output: Tensor = SurfConv2dFunction.apply(*arguments)
+
+
+def convolve(
+    input: Tensor,
+    weight: Tensor,
+    bias: Tensor | None,
+    scale: Tensor,
+    guide: Tensor | None,
+    guide_tolerance: float,
+    stride: PairArgument,
+    padding: PaddingArgument,
+    dilation: PairArgument,
+    groups: int,
+    window: Window | None = None,
+) -> Tensor:
+    """:func:`surf_conv2d`; a layer passes the window that it has checked for its scale."""
+    input, weight, bias = cast_to_autocast_dtype(input, weight, bias)
+    arguments, batched = check_surf_conv2d(
+        input,
+        weight,
+        bias,
+        scale,
+        guide,
+        guide_tolerance,
+        stride,
+        padding,
+        dilation,
+        groups,
+        window,
+    )
+    output = ops.surf_conv2d(*arguments)
     return output if batched else output.squeeze(0)

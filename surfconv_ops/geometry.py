@@ -30,6 +30,11 @@ def centre_fraction(kernel: int, dilation: int) -> float:
     return 0.5 * (dilation * (kernel - 1) % 2)
 
 
+def first_centre_pixel(kernel: int, padding: int, dilation: int) -> int:
+    """Integer part of ``centre(0)``."""
+    return dilation * (kernel - 1) // 2 - padding
+
+
 def centre_pixels(
     count: int,
     kernel: int,
@@ -43,7 +48,7 @@ def centre_pixels(
     It is also the pixel nearest to the centre, a half rounding down: ceil(centre - 1/2) equals
     floor(centre) for every multiple of one half.
     """
-    first = dilation * (kernel - 1) // 2 - padding
+    first = first_centre_pixel(kernel, padding, dilation)
     return torch.arange(count, device=device) * stride + first
 
 

@@ -18,7 +18,7 @@ from .checks import (
     check_shareable_conv2d,
 )
 from .depth_layer import DepthLayer, check_depth_options
-from .functional import surf_conv2d
+from .functional import convolve
 from .geometry import FloatPair
 from .levels import DepthLevels
 from .validation import check_window
@@ -289,18 +289,20 @@ class SurfConv2d(DepthLayer, nn.Conv2d):
             self.padding,  # type: ignore[arg-type]
             self.dilation,
         )
-        guide, tolerance = self._guide(depth)
-        return surf_conv2d(
+        # With a single tap there is no other point to see.
+        guide, tolerance = (None, 0.0) if window.kernel == (1, 1) else self._guide(depth)
+        return convolve(
             input,
             self.weight,
             self.bias,
-            scale=self._scale(depth, window),
-            guide=guide,
-            guide_tolerance=tolerance,
-            stride=self.stride,
-            padding=self.padding,  # type: ignore[arg-type]
-            dilation=self.dilation,
-            groups=self.groups,
+            self._scale(depth, window),
+            guide,
+            tolerance,
+            self.stride,
+            self.padding,  # type: ignore[arg-type]
+            self.dilation,
+            self.groups,
+            window,
         )
 
 

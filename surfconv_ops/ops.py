@@ -15,9 +15,8 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from . import _fallback, reference
+from . import _fallback, depth_ops, direct, reference
 from .autocast import autocast_disabled, cast_to_autocast_dtype
 from .geometry import Pair
 from .layout import memory_format_of
@@ -42,24 +41,20 @@ class _Library(torch.library.Library):
             return super().impl(op_name, fn, dispatch_key, **options)
 
         def guarded(keyset: Any, *args: Any) -> Any:
-            _refuse_tangents(args)
+            if direct.has_tangent(args):
+                raise NotImplementedError(
+                    f"{op_name} has no forward-mode derivative; use reverse mode (torch.func.vjp,"
+                    " jacrev, or backward)"
+                )
             return fn(keyset, *args)
 
         return super().impl(op_name, guarded, dispatch_key, **options)
 
 
-def _refuse_tangents(args: tuple[Any, ...]) -> None:
-    for arg in args:
-        if isinstance(arg, Tensor) and forward_ad.unpack_dual(arg).tangent is not None:
-            raise NotImplementedError(
-                "surf_conv2d has no forward-mode derivative; use reverse mode (torch.func.vjp,"
-                " jacrev, or backward)"
-            )
-
-
 # Kept for the life of the process: what it registered goes when it goes.
 _library = _Library("surfconv", "FRAGMENT")
 _fallback.register(_library)
+depth_ops.register(_library)
 _forward_op = torch.ops.surfconv.surf_conv2d.default
 _backward_op = torch.ops.surfconv.surf_conv2d_backward.default
 
@@ -155,6 +150,18 @@ def _differentiate_backward(ctx: Any, *cotangents: Tensor | None) -> Grads:
     return tuple(result)
 
 
+def surf_conv2d(*arguments: Any) -> Tensor:
+    """The operator on checked arguments, differentiable through torch.func as well."""
+    output: Tensor = direct.apply(SurfConv2dFunction, _forward_op, *arguments)
+    return output
+
+
+def _call_backward(*arguments: Any) -> tuple[Tensor, ...]:
+    grads: tuple[Tensor, ...] = direct.apply(SurfConv2dBackwardFunction, _backward_op, *arguments)
+    return grads
+
+
+@direct.takes_every_argument
 class SurfConv2dFunction(torch.autograd.Function):
     """The forward operator; its backward is :class:`SurfConv2dBackwardFunction`."""
 
@@ -171,8 +178,18 @@ class SurfConv2dFunction(torch.autograd.Function):
         dilation: Pair,
         groups: int,
     ) -> Tensor:
-        output: Tensor = _forward_op(
-            input, weight, bias, scale, guide, guide_tolerance, stride, padding, dilation, groups
+        output: Tensor = direct.run_kernel(
+            _forward_op,
+            input,
+            weight,
+            bias,
+            scale,
+            guide,
+            guide_tolerance,
+            stride,
+            padding,
+            dilation,
+            groups,
         )
         return output
 
@@ -182,13 +199,14 @@ class SurfConv2dFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad_output: Tensor) -> Grads:
-        return _differentiate_forward(SurfConv2dBackwardFunction.apply, ctx, grad_output)
+        return _differentiate_forward(_call_backward, ctx, grad_output)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, int]:
         return vmap_forward(SurfConv2dFunction.apply, info.batch_size, in_dims, args)
 
 
+@direct.takes_every_argument
 class SurfConv2dBackwardFunction(torch.autograd.Function):
     """The backward operator; its backward runs the reference's formulas."""
 
@@ -209,7 +227,8 @@ class SurfConv2dBackwardFunction(torch.autograd.Function):
         need_bias: bool,
         need_scale: bool,
     ) -> tuple[Tensor, ...]:
-        grads: tuple[Tensor, ...] = _backward_op(
+        grads: tuple[Tensor, ...] = direct.run_kernel(
+            _backward_op,
             grad_output,
             input,
             weight,

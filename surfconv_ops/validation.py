@@ -86,10 +86,11 @@ def check_window(
     pads = _check_padding(padding, kernel, stride, dilation)
     if size[0] < 1 or size[1] < 1:
         raise ValueError(f"{size_name}: expected at least one row and column, got {_by(size)}")
-    output = tuple(
-        geometry.output_size(size[i], kernel[i], stride[i], pads[i], dilation[i]) for i in (0, 1)
+    output = (
+        geometry.output_size(size[0], kernel[0], stride[0], pads[0], dilation[0]),
+        geometry.output_size(size[1], kernel[1], stride[1], pads[1], dilation[1]),
     )
-    window = Window(kernel, stride, pads, dilation, (output[0], output[1]))
+    window = Window(kernel, stride, pads, dilation, output)
     if output[0] < 1 or output[1] < 1:
         raise ValueError(
             f"{size_name}: {_by(size)} is too small for a {_by(kernel)} kernel with dilation"
@@ -128,19 +129,23 @@ def check_surf_conv2d(
     padding: Any,
     dilation: Any,
     groups: Any,
+    window: Window | None = None,
 ) -> tuple[SurfConv2dArguments, bool]:
-    """Arguments of :func:`surfconv_ops.surf_conv2d` in the operators' form, and if input had N."""
+    """Arguments of :func:`surfconv_ops.surf_conv2d` in the operators' form, and if input had N.
+
+    ``window`` is what :func:`check_window` gave for the input's size, where that is known already.
+    """
     _check_tensors(input, weight, bias, scale, guide)
     groups = check_integer(groups, "groups", 1)
     if input.ndim not in (3, 4):
         raise ValueError(f"input: expected (N, C, H, W) or (C, H, W), got {_shape(input)}")
     batched = input.ndim == 4
     _check_channels(input, weight, bias, groups)
-    size = (input.shape[-2], input.shape[-1])
-    window = check_window(
-        size, tuple(weight.shape[2:]), stride, padding, dilation, kernel_name="weight"
-    )
-    _check_scale(scale, input, window, batched)
+    kernel = tuple(weight.shape[2:])
+    if window is None or window.kernel != kernel:
+        size = (input.shape[-2], input.shape[-1])
+        window = check_window(size, kernel, stride, padding, dilation, kernel_name="weight")
+    _check_scale(scale, input, window)
     if guide is not None:
         _check_guide(guide, input)
     tolerance = check_not_negative(guide_tolerance, "guide_tolerance")
@@ -166,26 +171,32 @@ def check_surf_conv2d(
 
 def _check_tensors(input: Any, weight: Any, bias: Any, scale: Any, guide: Any) -> None:
     """Types, dtypes and devices."""
-    tensors = {"input": input, "weight": weight, "scale": scale}
-    tensors.update({k: v for k, v in (("bias", bias), ("guide", guide)) if v is not None})
-    for name, tensor in tensors.items():
-        if not isinstance(tensor, Tensor):
+    named = (
+        ("input", input),
+        ("weight", weight),
+        ("scale", scale),
+        ("bias", bias),
+        ("guide", guide),
+    )
+    for name, tensor in named:
+        if not isinstance(tensor, Tensor) and not (tensor is None and name in ("bias", "guide")):
             raise TypeError(f"{name}: expected a tensor, got {type_name(tensor)}")
-    if input.dtype not in FLOAT_DTYPES:
-        raise TypeError(f"input: expected one of {_names(FLOAT_DTYPES)}, got {input.dtype}")
-    for name, tensor in tensors.items():
-        if name in ("weight", "bias") and tensor.dtype != input.dtype:
-            raise TypeError(f"{name}: expected the input's dtype {input.dtype}, got {tensor.dtype}")
-        allowed = (torch.float32, input.dtype)
-        if name in ("scale", "guide") and tensor.dtype not in allowed:
-            raise TypeError(
-                f"{name}: expected {_names(dict.fromkeys(allowed))} (float32 or the input's"
-                f" dtype), got {tensor.dtype}"
-            )
-        if tensor.device != input.device:
-            raise ValueError(
-                f"{name}: expected the input's device {input.device}, got {tensor.device}"
-            )
+    dtype, device = input.dtype, input.device
+    if dtype not in FLOAT_DTYPES:
+        raise TypeError(f"input: expected one of {_names(FLOAT_DTYPES)}, got {dtype}")
+    for name, tensor in named:
+        if tensor is None:
+            continue
+        if tensor.dtype != dtype:
+            if name in ("weight", "bias"):
+                raise TypeError(f"{name}: expected the input's dtype {dtype}, got {tensor.dtype}")
+            if tensor.dtype != torch.float32:
+                raise TypeError(
+                    f"{name}: expected {_names(dict.fromkeys((torch.float32, dtype)))} (float32 or"
+                    f" the input's dtype), got {tensor.dtype}"
+                )
+        if tensor.device != device:
+            raise ValueError(f"{name}: expected the input's device {device}, got {tensor.device}")
 
 
 def _check_channels(input: Tensor, weight: Tensor, bias: Tensor | None, groups: int) -> None:
@@ -217,8 +228,10 @@ def _check_channels(input: Tensor, weight: Tensor, bias: Tensor | None, groups: 
         )
 
 
-def _check_scale(scale: Tensor, input: Tensor, window: Window, batched: bool) -> None:
-    lead = (input.shape[0],) if batched else ()
+def _check_scale(scale: Tensor, input: Tensor, window: Window) -> None:
+    lead = tuple(input.shape[:-3])
+    if tuple(scale.shape) == (*lead, 1, *window.output):
+        return
     shapes = [(*lead, *channels, *window.output) for channels in ((), (1,), (2,))]
     if tuple(scale.shape) not in shapes:
         raise ValueError(

@@ -15,10 +15,13 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "lane_forward.inl"
 #include "scatter.inl"
 #include "scatter_interior.inl"
+#include "pointwise_pixels.inl"
+#include "pointwise.inl"
 #include "forward.inl"
 #include "bands.inl"
 #include "gradient_rows.inl"
 #include "output_gradient.inl"
+#include "pointwise_backward.inl"
 #include "backward_tile.inl"
 #include "backward.inl"
 

@@ -244,10 +244,19 @@ class Backward {
   int64_t weight_elements_ = 0;
 };
 
+template <class T>
+void run_backward(const Conv& conv, const BackwardTensors& tensors, const Executor& executor) {
+  if (is_pointwise(conv)) {
+    PointwiseBackward<T>(conv, tensors, executor).run();
+  } else {
+    Backward<T>(conv, tensors, executor).run();
+  }
+}
+
 void backward(const Conv& conv, const BackwardTensors& tensors, const Executor& executor) {
   if (tensors.input.dtype == DType::f64) {
-    Backward<double>(conv, tensors, executor).run();
+    run_backward<double>(conv, tensors, executor);
   } else {
-    Backward<float>(conv, tensors, executor).run();
+    run_backward<float>(conv, tensors, executor);
   }
 }

@@ -205,10 +205,19 @@ class Forward {
   Buffer<T> weights_;
 };
 
+template <class T>
+void run_forward(const Conv& conv, const ForwardTensors& tensors, const Executor& executor) {
+  if (is_pointwise(conv)) {
+    PointwiseForward<T>(conv, tensors, executor).run();
+  } else {
+    Forward<T>(conv, tensors, executor).run();
+  }
+}
+
 void forward(const Conv& conv, const ForwardTensors& tensors, const Executor& executor) {
   if (tensors.input.dtype == DType::f64) {
-    Forward<double>(conv, tensors, executor).run();
+    run_forward<double>(conv, tensors, executor);
   } else {
-    Forward<float>(conv, tensors, executor).run();
+    run_forward<float>(conv, tensors, executor);
   }
 }
