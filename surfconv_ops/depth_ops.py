@@ -150,7 +150,6 @@ def _backward_of(grad: Tensor, depth: Tensor, *numbers: float) -> Tensor:
     return result
 
 
-@direct.takes_every_argument
 class DepthToScaleFunction(torch.autograd.Function):
     """The forward operator; its derivative is :class:`DepthToScaleBackwardFunction`."""
 
@@ -189,7 +188,6 @@ class DepthToScaleFunction(torch.autograd.Function):
         return DepthToScaleFunction.apply(depth, *numbers), in_dims[0]
 
 
-@direct.takes_every_argument
 class DepthToScaleBackwardFunction(torch.autograd.Function):
     """The derivative's operator; its own derivatives are plain products with the slopes."""
 

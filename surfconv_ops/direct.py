@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -49,29 +48,3 @@ def run_kernel(operator: Any, *args: Any) -> Any:
         return operator(*args)
     with _below_autograd():
         return operator(*args)
-
-
-def takes_every_argument(function: Any) -> Any:
-    """Class decorator of a Function whose forward has no defaults.
-
-    ``Function.apply`` inspects forward's signature and fills in its defaults in every call.
-    """
-    function.forward.__signature__ = _Complete.from_callable(function.forward)
-    return function
-
-
-class _Complete(inspect.Signature):
-    """A signature to which positional arguments are bound as they come."""
-
-    def bind(self, *args: Any, **kwargs: Any) -> Any:
-        return super().bind(*args, **kwargs) if kwargs else _Bound(args)
-
-
-class _Bound:
-    kwargs: ClassVar[dict[str, Any]] = {}
-
-    def __init__(self, args: tuple[Any, ...]) -> None:
-        self.args = args
-
-    def apply_defaults(self) -> None:
-        """There are none."""

@@ -161,7 +161,6 @@ def _call_backward(*arguments: Any) -> tuple[Tensor, ...]:
     return grads
 
 
-@direct.takes_every_argument
 class SurfConv2dFunction(torch.autograd.Function):
     """The forward operator; its backward is :class:`SurfConv2dBackwardFunction`."""
 
@@ -206,7 +205,6 @@ class SurfConv2dFunction(torch.autograd.Function):
         return vmap_forward(SurfConv2dFunction.apply, info.batch_size, in_dims, args)
 
 
-@direct.takes_every_argument
 class SurfConv2dBackwardFunction(torch.autograd.Function):
     """The backward operator; its backward runs the reference's formulas."""
 
