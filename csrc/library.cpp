@@ -15,6 +15,22 @@ STABLE_TORCH_LIBRARY(surfconv, m) {
       "int groups, bool need_input, bool need_weight, bool need_bias, bool need_scale) "
       "-> (Tensor, Tensor, Tensor, Tensor)");
   m.def("level_values(Tensor depth, Tensor edges, Tensor values) -> Tensor");
+  m.def(
+      "surf_max_pool2d(Tensor input, Tensor scale, Tensor? guide, float guide_tolerance, "
+      "int[] kernel_size, int[] stride, int[] padding, int[] dilation) -> (Tensor, Tensor)");
+  m.def(
+      "surf_max_pool2d_backward(Tensor grad_output, Tensor input, Tensor scale, Tensor? guide, "
+      "Tensor winner, float guide_tolerance, int[] kernel_size, int[] stride, int[] padding, "
+      "int[] dilation, bool need_input, bool need_scale) -> (Tensor, Tensor)");
+  m.def(
+      "surf_avg_pool2d(Tensor input, Tensor scale, Tensor? guide, float guide_tolerance, "
+      "int[] kernel_size, int[] stride, int[] padding, bool count_include_pad, "
+      "int divisor_override) -> Tensor");
+  m.def(
+      "surf_avg_pool2d_backward(Tensor grad_output, Tensor input, Tensor scale, Tensor? guide, "
+      "float guide_tolerance, int[] kernel_size, int[] stride, int[] padding, "
+      "bool count_include_pad, int divisor_override, bool need_input, bool need_scale) "
+      "-> (Tensor, Tensor)");
   m.def("cpu_capability() -> str");
 }
 

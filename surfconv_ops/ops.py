@@ -28,7 +28,7 @@ _BACKWARD = "surfconv::surf_conv2d_backward"
 _AUTOCAST_KEYS = {"AutocastCPU": "cpu", "AutocastCUDA": "cuda"}
 
 
-class _Library(torch.library.Library):
+class Library(torch.library.Library):
     """A library whose derivatives refuse forward mode.
 
     What register_autograd makes is skipped where nothing requires a gradient, and would lose a
@@ -52,13 +52,13 @@ def _refuse_tangents(args: tuple[Any, ...]) -> None:
     for arg in args:
         if isinstance(arg, Tensor) and forward_ad.unpack_dual(arg).tangent is not None:
             raise NotImplementedError(
-                "surf_conv2d has no forward-mode derivative; use reverse mode (torch.func.vjp,"
-                " jacrev, or backward)"
+                "surfconv's operators have no forward-mode derivative; use reverse mode"
+                " (torch.func.vjp, jacrev, or backward)"
             )
 
 
 # Kept for the life of the process: what it registered goes when it goes.
-_library = _Library("surfconv", "FRAGMENT")
+_library = Library("surfconv", "FRAGMENT")
 _fallback.register(_library)
 _forward_op = torch.ops.surfconv.surf_conv2d.default
 _backward_op = torch.ops.surfconv.surf_conv2d_backward.default

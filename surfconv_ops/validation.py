@@ -130,7 +130,8 @@ def check_surf_conv2d(
     groups: Any,
 ) -> tuple[SurfConv2dArguments, bool]:
     """Arguments of :func:`surfconv_ops.surf_conv2d` in the operators' form, and if input had N."""
-    _check_tensors(input, weight, bias, scale, guide)
+    optional = {k: v for k, v in (("bias", bias), ("guide", guide)) if v is not None}
+    check_tensors(input, {"weight": weight, "scale": scale} | optional)
     groups = check_integer(groups, "groups", 1)
     if input.ndim not in (3, 4):
         raise ValueError(f"input: expected (N, C, H, W) or (C, H, W), got {_shape(input)}")
@@ -140,9 +141,9 @@ def check_surf_conv2d(
     window = check_window(
         size, tuple(weight.shape[2:]), stride, padding, dilation, kernel_name="weight"
     )
-    _check_scale(scale, input, window, batched)
+    check_scale(scale, input, window, batched)
     if guide is not None:
-        _check_guide(guide, input)
+        check_guide(guide, input)
     tolerance = check_not_negative(guide_tolerance, "guide_tolerance")
     if not batched:
         input, scale = input.unsqueeze(0), scale.unsqueeze(0)
@@ -164,10 +165,9 @@ def check_surf_conv2d(
     return arguments, batched
 
 
-def _check_tensors(input: Any, weight: Any, bias: Any, scale: Any, guide: Any) -> None:
-    """Types, dtypes and devices."""
-    tensors = {"input": input, "weight": weight, "scale": scale}
-    tensors.update({k: v for k, v in (("bias", bias), ("guide", guide)) if v is not None})
+def check_tensors(input: Any, others: dict[str, Any]) -> None:
+    """Types, dtypes and devices of input and of the arguments that go with it, by name."""
+    tensors = {"input": input} | others
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor):
             raise TypeError(f"{name}: expected a tensor, got {type_name(tensor)}")
@@ -217,7 +217,7 @@ def _check_channels(input: Tensor, weight: Tensor, bias: Tensor | None, groups: 
         )
 
 
-def _check_scale(scale: Tensor, input: Tensor, window: Window, batched: bool) -> None:
+def check_scale(scale: Tensor, input: Tensor, window: Window, batched: bool) -> None:
     lead = (input.shape[0],) if batched else ()
     shapes = [(*lead, *channels, *window.output) for channels in ((), (1,), (2,))]
     if tuple(scale.shape) not in shapes:
@@ -228,7 +228,7 @@ def _check_scale(scale: Tensor, input: Tensor, window: Window, batched: bool) ->
         )
 
 
-def _check_guide(guide: Tensor, input: Tensor) -> None:
+def check_guide(guide: Tensor, input: Tensor) -> None:
     expected = (*input.shape[:-3], *input.shape[-2:])
     if tuple(guide.shape) != expected:
         raise ValueError(
