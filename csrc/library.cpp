@@ -4,6 +4,7 @@
 
 #include "level_values.h"
 #include "surf_conv2d.h"
+#include "surf_pool2d.h"
 
 STABLE_TORCH_LIBRARY(surfconv, m) {
   m.def(
@@ -38,6 +39,10 @@ STABLE_TORCH_LIBRARY_IMPL(surfconv, CPU, m) {
   m.impl("surf_conv2d", TORCH_BOX(&surfconv::surf_conv2d));
   m.impl("surf_conv2d_backward", TORCH_BOX(&surfconv::surf_conv2d_backward));
   m.impl("level_values", TORCH_BOX(&surfconv::level_values));
+  m.impl("surf_max_pool2d", TORCH_BOX(&surfconv::surf_max_pool2d));
+  m.impl("surf_max_pool2d_backward", TORCH_BOX(&surfconv::surf_max_pool2d_backward));
+  m.impl("surf_avg_pool2d", TORCH_BOX(&surfconv::surf_avg_pool2d));
+  m.impl("surf_avg_pool2d_backward", TORCH_BOX(&surfconv::surf_avg_pool2d_backward));
 }
 
 STABLE_TORCH_LIBRARY_IMPL(surfconv, CompositeExplicitAutograd, m) {

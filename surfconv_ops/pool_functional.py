@@ -29,8 +29,8 @@ def surf_max_pool2d(
     axis' scale is exactly 1, taps outside the image are left out as they are there.
 
     The gradient goes to the winning tap's pixels by their interpolation weights, and through the
-    tap's position to the scale; the first of equal taps wins, and NaN wins over all. Where the scale
-    is not finite only taps of zero offset are left. An output without any tap is 0.
+    tap's position to the scale; the first of equal taps wins, and NaN wins over all. Where the
+    scale is not finite only taps of zero offset are left. An output without any tap is 0.
 
     Derivatives of any order work, forward-mode differentiation raises.
 

@@ -126,7 +126,7 @@ class _ClampedAxis(_Axis):
         pixel = low + (fraction.detach() == 1)
         inside = inside & ((scale != 1) | ((pixel >= 0) & (pixel <= last)))
         clamped = before | behind
-        low = torch.where(before, 0, torch.where(behind, last, low))
+        low = torch.where(before, 0, torch.where(behind, last, low)).clamp(0, last)
         fraction = torch.where(clamped, 0.0, fraction)
         moves = (~clamped).to(scale.dtype)
         return [

@@ -21,6 +21,10 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "output_gradient.inl"
 #include "backward_tile.inl"
 #include "backward.inl"
+#include "pool_samples.inl"
+#include "pool_images.inl"
+#include "pool_forward.inl"
+#include "pool_backward.inl"
 
 }  // namespace surfconv::cpu::SURFCONV_ISA
 

@@ -1,0 +1,261 @@
+// The pools' backward. The input's gradient is shared out by channels, the scale's by pixels: no
+// two workers write to one place, and no sum depends on how many there are.
+
+template <class T, class W>
+SURFCONV_INLINE void scatter_winners(const PoolCorners<T>& corners, int64_t taps, int64_t channels,
+                                     const T* grad, const W* winners, T* to) {
+  const auto tap_of = [&](int64_t c) { return std::min<int64_t>(winners[c], taps); };
+  if (corners.each == 4) {
+    for (int64_t c = 0; c < channels; ++c) {
+      const int64_t q = tap_of(c) * 4;
+      const T g = grad[c];
+      to[corners.offset[q] + c] += corners.weight[q] * g;
+      to[corners.offset[q + 1] + c] += corners.weight[q + 1] * g;
+      to[corners.offset[q + 2] + c] += corners.weight[q + 2] * g;
+      to[corners.offset[q + 3] + c] += corners.weight[q + 3] * g;
+    }
+    return;
+  }
+  for (int64_t c = 0; c < channels; ++c) {
+    const int64_t t = tap_of(c);
+    for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
+      to[corners.offset[q] + c] += corners.weight[q] * grad[c];
+    }
+  }
+}
+
+// grad is changed: it becomes the gradient of the sum.
+template <class T>
+SURFCONV_INLINE void scatter_average(const PoolCorners<T>& corners, T divisor, int64_t channels,
+                                     T* grad, T* to) {
+  if (divisor == 0) return;
+  for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
+    using V = Vec<T, decltype(width)::lanes>;
+    store(grad + c, V(load<V>(grad + c) / divisor));
+  });
+  for (int64_t q = 0; q < corners.count; ++q) {
+    T* pixel = to + corners.offset[q];
+    const T weight = corners.weight[q];
+    for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
+      using V = Vec<T, decltype(width)::lanes>;
+      store(pixel + c, V(load<V>(pixel + c) + weight * load<V>(grad + c)));
+    });
+  }
+}
+
+// body(sampler, pixel of the tile, flat output pixel with n, first channel, channels, gradient of
+// the pixel's channels, where the image's gradient lies)
+template <Edges E, class T, class Body>
+void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const Executor& executor,
+                     const Body& body) {
+  const int64_t outputs = pool.y.out * pool.x.out, inputs = pool.y.in * pool.x.in;
+  const View& target = tensors.grad_input;
+  const bool direct = has_whole_pixels<T>(target, pool.channels);
+  // Few blocks, because each looks for all the corners anew; enough for every worker, in whole
+  // cache lines.
+  constexpr int64_t kLeast = 64 / sizeof(T), kMostScratch = int64_t{8} << 20;
+  int64_t block = round_up(pool.channels, kLeast);
+  const int64_t wanted = executor.threads == 1 ? 1 : 2 * executor.threads;
+  while (block > kLeast &&
+         (pool.batch * ((pool.channels + block - 1) / block) < wanted ||
+          (!direct && inputs * block * static_cast<int64_t>(sizeof(T)) > kMostScratch))) {
+    block = round_up(block / 2, kLeast);
+  }
+  const int64_t blocks = (pool.channels + block - 1) / block;
+  const int64_t padded = std::min(block, to_quads(pool.channels));
+  const int64_t step_x = direct ? target.x : padded;
+  const int64_t step_y = direct ? target.y : pool.x.in * padded;
+  const int workers = workers_for(executor, pool.batch * blocks,
+                                  pool.batch * outputs * pool.channels * pool.taps());
+  const int64_t image_size = direct ? 0 : inputs * padded;
+  const int64_t scratch = PoolSampler<E, T>::need(pool) + Workspace::need<T>(kTile * padded) +
+                          Workspace::need<T>(image_size);
+  PoolImages<T> images(pool, {}, tensors.guide);
+  images.for_groups(executor, [&](int64_t first_image, int64_t count) {
+    run_tasks(executor, count * blocks, workers, [&](int, int64_t task) {
+      Workspace memory(scratch);
+      PoolSampler<E, T> sampler(pool, step_y, step_x, memory);
+      T* grads = memory.take<T>(kTile * padded);
+      T* image = memory.take<T>(image_size);
+      const int64_t n = first_image + task / blocks, first_channel = task % blocks * block;
+      const int64_t channels = std::min(block, pool.channels - first_channel);
+      if (direct) {
+        image = static_cast<T*>(target.data) + n * target.n + first_channel;
+        for (int64_t y = 0; y < pool.y.in; ++y) {
+          for (int64_t x = 0; x < pool.x.in; ++x) {
+            std::fill_n(image + y * step_y + x * step_x, channels, T(0));
+          }
+        }
+      } else {
+        std::fill_n(image, image_size, T(0));
+      }
+      for (int64_t first = 0; first < outputs; first += kTile) {
+        const int64_t pixels = std::min<int64_t>(kTile, outputs - first);
+        sampler.start_tile(tensors.scale, images.guide(n), n, first, pixels);
+        load_pixels<T>(tensors.grad_output, n, first_channel, channels, pool.x.out, first, pixels,
+                       grads, padded, padded);
+        for (int64_t m = 0; m < pixels; ++m) {
+          sampler.template list<false>(m);
+          body(sampler, m, n * outputs + first + m, first_channel, channels, grads + m * padded,
+               image);
+        }
+      }
+      if (!direct) {
+        store_pixels<T>(target, n, first_channel, channels, pool.x.in, 0, inputs, image, padded);
+      }
+    });
+  });
+}
+
+template <class T>
+struct ScaleGradient {
+  T y = 0, x = 0;
+};
+
+// body(sampler, image, pixel of the tile, flat output pixel with n, gradient of its channels) gives
+// the gradient of (scale_y, scale_x).
+template <Edges E, class T, class Body>
+void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const Executor& executor,
+                     const Body& body) {
+  const int64_t outputs = pool.y.out * pool.x.out, padded = to_quads(pool.channels);
+  PoolImages<T> images(pool, tensors.input, tensors.guide);
+  const int workers = workers_for(executor, pool.batch * pool_tiles(pool),
+                                  pool.batch * outputs * padded * pool.taps());
+  const int64_t scratch = PoolSampler<E, T>::need(pool) + Workspace::need<T>(kTile * padded);
+  std::vector<Workspace> memory;
+  std::vector<PoolSampler<E, T>> samplers;
+  std::vector<T*> rows;
+  for (int worker = 0; worker < workers; ++worker) {
+    memory.emplace_back(scratch);
+    samplers.emplace_back(pool, images.step_y(), images.step_x(), memory.back());
+    rows.push_back(memory.back().take<T>(kTile * padded));
+  }
+  images.for_groups(executor, [&](int64_t first_image, int64_t count) {
+    for_pool_tiles(
+        pool, executor, workers, first_image, count, [&](int worker, int64_t n, int64_t tile) {
+          auto& sampler = samplers[static_cast<size_t>(worker)];
+          T* grads = rows[static_cast<size_t>(worker)];
+          const int64_t first = tile * kTile, pixels = std::min<int64_t>(kTile, outputs - first);
+          sampler.start_tile(tensors.scale, images.guide(n), n, first, pixels);
+          load_pixels<T>(tensors.grad_output, n, 0, pool.channels, pool.x.out, first, pixels, grads,
+                         padded, padded);
+          T along_y[kTile], along_x[kTile];
+          for (int64_t m = 0; m < pixels; ++m) {
+            sampler.template list<true>(m);
+            const ScaleGradient<T> grad =
+                body(sampler, images.image(n), m, n * outputs + first + m, grads + m * padded);
+            along_y[m] = pool.scale_components == 1 ? grad.y + grad.x : grad.y;
+            along_x[m] = grad.x;
+          }
+          store_pixels<T>(tensors.grad_scale, n, 0, 1, pool.x.out, first, pixels, along_y, 1);
+          if (pool.scale_components == 2) {
+            store_pixels<T>(tensors.grad_scale, n, 1, 1, pool.x.out, first, pixels, along_x, 1);
+          }
+        });
+  });
+}
+
+template <class T>
+void max_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
+                          const Executor& executor) {
+  const int64_t taps = pool.taps();
+  visit_winners(tensors.winners, [&](const auto* winners) {
+    if (tensors.grad_input.data != nullptr) {
+      pool_grad_input<Edges::clamp, T>(
+          pool, tensors, executor,
+          [&](const auto& sampler, int64_t, int64_t pixel, int64_t first, int64_t channels,
+              const T* grad, T* image) {
+            if (sampler.corners.count == 0) return;
+            scatter_winners(sampler.corners, taps, channels, grad,
+                            winners + pixel * pool.channels + first, image);
+          });
+    }
+    if (tensors.grad_scale.data == nullptr) return;
+    pool_grad_scale<Edges::clamp, T>(
+        pool, tensors, executor,
+        [&](const auto& sampler, const T* image, int64_t, int64_t pixel, const T* grad) {
+          const PoolCorners<T>& corners = sampler.corners;
+          double along_y = 0, along_x = 0;
+          for (int64_t c = 0; c < pool.channels; ++c) {
+            const int64_t t = std::min<int64_t>(winners[pixel * pool.channels + c], taps);
+            T slope_y = 0, slope_x = 0;
+            for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
+              const T value = image[corners.offset[q] + c];
+              slope_y += corners.slope_y[q] * value;
+              slope_x += corners.slope_x[q] * value;
+            }
+            along_y += static_cast<double>(slope_y) * static_cast<double>(grad[c]);
+            along_x += static_cast<double>(slope_x) * static_cast<double>(grad[c]);
+          }
+          return ScaleGradient<T>{static_cast<T>(along_y), static_cast<T>(along_x)};
+        });
+  });
+}
+
+template <class T>
+T channel_product(int64_t channels, const T* a, const T* b) {
+  Vec<T, kLanes<T>> sum{};
+  int64_t c = 0;
+  for (; c + kLanes<T> <= channels; c += kLanes<T>) {
+    sum += load<Vec<T, kLanes<T>>>(a + c) * load<Vec<T, kLanes<T>>>(b + c);
+  }
+  T total = sum_lanes<T>(sum);
+  for (; c < channels; ++c) total += a[c] * b[c];
+  return total;
+}
+
+template <class T>
+void avg_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
+                          const Executor& executor) {
+  const int64_t padded = to_quads(pool.channels);
+  if (tensors.grad_input.data != nullptr) {
+    pool_grad_input<Edges::zero, T>(
+        pool, tensors, executor,
+        [&](const auto& sampler, int64_t m, int64_t, int64_t, int64_t channels, T* grad, T* image) {
+          scatter_average(sampler.corners, sampler.divisor(m), to_quads(channels), grad, image);
+        });
+  }
+  if (tensors.grad_scale.data == nullptr) return;
+  const bool weighted = pool.divisor_override == 0 && !pool.count_include_pad;
+  pool_grad_scale<Edges::zero, T>(
+      pool, tensors, executor,
+      [&](const auto& sampler, const T* image, int64_t m, int64_t, const T* grad) {
+        const PoolCorners<T>& corners = sampler.corners;
+        const T divisor = sampler.divisor(m);
+        if (divisor == 0) return ScaleGradient<T>{};
+        const auto product = [&](int64_t q) {
+          return static_cast<double>(channel_product(padded, grad, image + corners.offset[q]));
+        };
+        // Where the weights make up the divisor, the mean comes off each corner's value.
+        double mean = 0;
+        if (weighted) {
+          for (int64_t q = 0; q < corners.count; ++q) {
+            if (corners.weight[q] != 0) mean += static_cast<double>(corners.weight[q]) * product(q);
+          }
+          mean /= static_cast<double>(divisor);
+        }
+        double along_y = 0, along_x = 0;
+        for (int64_t q = 0; q < corners.count; ++q) {
+          if (corners.slope_y[q] == 0 && corners.slope_x[q] == 0) continue;
+          const double value = product(q) - mean;
+          along_y += static_cast<double>(corners.slope_y[q]) * value;
+          along_x += static_cast<double>(corners.slope_x[q]) * value;
+        }
+        return ScaleGradient<T>{static_cast<T>(along_y / static_cast<double>(divisor)),
+                                static_cast<T>(along_x / static_cast<double>(divisor))};
+      });
+}
+
+inline void max_pool_backward(const Pool& pool, const PoolBackwardTensors& tensors,
+                              const Executor& executor) {
+  tensors.input.dtype == DType::f64 ? max_pool_backward_of<double>(pool, tensors, executor)
+                                    : max_pool_backward_of<float>(pool, tensors, executor);
+}
+inline void avg_pool_backward(const Pool& pool, const PoolBackwardTensors& tensors,
+                              const Executor& executor) {
+  tensors.input.dtype == DType::f64 ? avg_pool_backward_of<double>(pool, tensors, executor)
+                                    : avg_pool_backward_of<float>(pool, tensors, executor);
+}
+
+inline constexpr PoolKernels pool_kernels = {max_pool_forward, max_pool_backward, avg_pool_forward,
+                                             avg_pool_backward};
