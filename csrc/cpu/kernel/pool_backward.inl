@@ -1,26 +1,40 @@
 // The pools' backward. The input's gradient is shared out by channels, the scale's by pixels: no
 // two workers write to one place, and no sum depends on how many there are.
 
+// winners and grad: whole quads of channels.
 template <class T, class W>
 SURFCONV_INLINE void scatter_winners(const PoolCorners<T>& corners, int64_t taps, int64_t channels,
                                      const T* grad, const W* winners, T* to) {
-  const auto tap_of = [&](int64_t c) { return std::min<int64_t>(winners[c], taps); };
-  if (corners.each == 4) {
+  if (corners.each == 1) {
     for (int64_t c = 0; c < channels; ++c) {
-      const int64_t q = tap_of(c) * 4;
-      const T g = grad[c];
-      to[corners.offset[q] + c] += corners.weight[q] * g;
-      to[corners.offset[q + 1] + c] += corners.weight[q + 1] * g;
-      to[corners.offset[q + 2] + c] += corners.weight[q + 2] * g;
-      to[corners.offset[q + 3] + c] += corners.weight[q + 3] * g;
+      const int64_t q = std::min<int64_t>(winners[c], taps);
+      to[corners.offset[q] + c] += corners.weight[q] * grad[c];
     }
     return;
   }
-  for (int64_t c = 0; c < channels; ++c) {
-    const int64_t t = tap_of(c);
-    for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
-      to[corners.offset[q] + c] += corners.weight[q] * grad[c];
+  // All channels by all taps: which tap has won a channel is random, and so would be branches on
+  // it.
+  const auto scatter = [&](int64_t c, auto width) SURFCONV_INLINED {
+    constexpr int lanes = decltype(width)::lanes;
+    using V = Vec<T, lanes>;
+    using Mask = decltype(V{} > V{});
+    using Number = std::conditional_t<sizeof(T) == 8, int64_t, int32_t>;
+    const V all = load<V>(grad + c);
+    const Mask winner = __builtin_convertvector(load<Vec<W, lanes>>(winners + c), Mask);
+    for (int64_t t = 0; t < taps; ++t) {
+      const Mask won = winner == Mask{} + static_cast<Number>(t);
+      const V share = won ? all : V{};
+      for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
+        T* pixel = to + corners.offset[q] + c;
+        store(pixel, V(load<V>(pixel) + corners.weight[q] * share));
+      }
     }
+  };
+  constexpr int lanes = kMaxLanes<T>;
+  int64_t c = 0;
+  for (; c + lanes <= channels; c += lanes) scatter(c, Width<lanes>{});
+  if constexpr (lanes > 4) {
+    if (c < channels) scatter(c, Width<4>{});
   }
 }
 
@@ -43,8 +57,8 @@ SURFCONV_INLINE void scatter_average(const PoolCorners<T>& corners, T divisor, i
   }
 }
 
-// body(sampler, pixel of the tile, flat output pixel with n, first channel, channels, gradient of
-// the pixel's channels, where the image's gradient lies)
+// body(sampler, worker's row of winners, pixel of the tile, flat output pixel with n, first
+// channel, channels, gradient of the pixel's channels, where the image's gradient lies)
 template <Edges E, class T, class Body>
 void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const Executor& executor,
                      const Body& body) {
@@ -69,12 +83,13 @@ void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const
                                   pool.batch * outputs * pool.channels * pool.taps());
   const int64_t image_size = direct ? 0 : inputs * padded;
   const int64_t scratch = PoolSampler<E, T>::need(pool) + Workspace::need<T>(kTile * padded) +
-                          Workspace::need<T>(image_size);
+                          Workspace::need<T>(image_size) + Workspace::need<uint32_t>(padded);
   PoolImages<T> images(pool, {}, tensors.guide);
   images.for_groups(executor, [&](int64_t first_image, int64_t count) {
     run_tasks(executor, count * blocks, workers, [&](int, int64_t task) {
       Workspace memory(scratch);
       PoolSampler<E, T> sampler(pool, step_y, step_x, memory);
+      uint32_t* numbers = memory.take<uint32_t>(padded);
       T* grads = memory.take<T>(kTile * padded);
       T* image = memory.take<T>(image_size);
       const int64_t n = first_image + task / blocks, first_channel = task % blocks * block;
@@ -96,8 +111,8 @@ void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const
                        grads, padded, padded);
         for (int64_t m = 0; m < pixels; ++m) {
           sampler.template list<false>(m);
-          body(sampler, m, n * outputs + first + m, first_channel, channels, grads + m * padded,
-               image);
+          body(sampler, numbers, m, n * outputs + first + m, first_channel, channels,
+               grads + m * padded, image);
         }
       }
       if (!direct) {
@@ -163,11 +178,17 @@ void max_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
     if (tensors.grad_input.data != nullptr) {
       pool_grad_input<Edges::clamp, T>(
           pool, tensors, executor,
-          [&](const auto& sampler, int64_t, int64_t pixel, int64_t first, int64_t channels,
-              const T* grad, T* image) {
+          [&](const auto& sampler, uint32_t* numbers, int64_t, int64_t pixel, int64_t first,
+              int64_t channels, const T* grad, T* image) {
             if (sampler.corners.count == 0) return;
-            scatter_winners(sampler.corners, taps, channels, grad,
-                            winners + pixel * pool.channels + first, image);
+            const auto* row = winners + pixel * pool.channels + first;
+            if (channels % kQuad == 0) {
+              return scatter_winners(sampler.corners, taps, channels, grad, row, image);
+            }
+            // The tensor ends where its last channel does.
+            std::copy_n(row, channels, numbers);
+            std::fill(numbers + channels, numbers + to_quads(channels), 0);
+            scatter_winners(sampler.corners, taps, to_quads(channels), grad, numbers, image);
           });
     }
     if (tensors.grad_scale.data == nullptr) return;
@@ -209,11 +230,12 @@ void avg_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
                           const Executor& executor) {
   const int64_t padded = to_quads(pool.channels);
   if (tensors.grad_input.data != nullptr) {
-    pool_grad_input<Edges::zero, T>(
-        pool, tensors, executor,
-        [&](const auto& sampler, int64_t m, int64_t, int64_t, int64_t channels, T* grad, T* image) {
-          scatter_average(sampler.corners, sampler.divisor(m), to_quads(channels), grad, image);
-        });
+    pool_grad_input<Edges::zero, T>(pool, tensors, executor,
+                                    [&](const auto& sampler, const auto&, int64_t m, int64_t,
+                                        int64_t, int64_t channels, T* grad, T* image) {
+                                      scatter_average(sampler.corners, sampler.divisor(m),
+                                                      to_quads(channels), grad, image);
+                                    });
   }
   if (tensors.grad_scale.data == nullptr) return;
   const bool weighted = pool.divisor_override == 0 && !pool.count_include_pad;

@@ -4,30 +4,48 @@
 template <class T>
 constexpr int kMaxLanes = std::min(SURFCONV_VECTOR_BYTES, 32) / static_cast<int>(sizeof(T));
 
+// Vectors at a time, so that one need not wait for the other.
+constexpr int kMaxVectors = SURFCONV_VECTOR_BYTES == 64 ? 4 : 2;
+
 // Each: corners of every tap, or 0. Later NaNs win over earlier ones, as in nn.
-template <int Each, int Lanes, class T, class W>
+template <int Each, int Lanes, int Vectors, class T, class W>
 SURFCONV_INLINE void max_of_taps(const T* image, const PoolCorners<T>& corners, int64_t taps,
                                  int32_t fallback, T* out, W* winners) {
   using V = Vec<T, Lanes>;
   using Mask = decltype(V{} > V{});
   using Number = std::conditional_t<sizeof(T) == 8, int64_t, int32_t>;
-  V best = broadcast<V>(-std::numeric_limits<T>::infinity());
-  Mask winner = Mask{} + static_cast<Number>(fallback);
+  V best[Vectors];
+  Mask winner[Vectors];
+  for (int i = 0; i < Vectors; ++i) {
+    best[i] = broadcast<V>(-std::numeric_limits<T>::infinity());
+    winner[i] = Mask{} + static_cast<Number>(fallback);
+  }
   for (int64_t t = 0; t < taps; ++t) {
     const int32_t begin = Each != 0 ? static_cast<int32_t>(t) * Each : corners.first[t];
     const int32_t end = Each != 0 ? begin + Each : corners.first[t + 1];
     if (Each == 0 && begin == end) continue;
-    V value = corners.weight[begin] * load<V>(image + corners.offset[begin]);
+    V value[Vectors];
 #pragma GCC unroll 4
-    for (int32_t q = begin + 1; q < end; ++q) {
-      value += corners.weight[q] * load<V>(image + corners.offset[q]);
+    for (int i = 0; i < Vectors; ++i) {
+      value[i] = corners.weight[begin] * load<V>(image + corners.offset[begin] + i * Lanes);
     }
-    const Mask wins = (value > best) | (value != value);
-    best = wins ? value : best;
-    winner = wins ? Mask{} + static_cast<Number>(t) : winner;
+    for (int32_t q = begin + 1; q < end; ++q) {
+#pragma GCC unroll 4
+      for (int i = 0; i < Vectors; ++i) {
+        value[i] += corners.weight[q] * load<V>(image + corners.offset[q] + i * Lanes);
+      }
+    }
+#pragma GCC unroll 4
+    for (int i = 0; i < Vectors; ++i) {
+      const Mask wins = (value[i] > best[i]) | (value[i] != value[i]);
+      best[i] = wins ? value[i] : best[i];
+      winner[i] = wins ? Mask{} + static_cast<Number>(t) : winner[i];
+    }
   }
-  store(out, best);
-  store(winners, __builtin_convertvector(winner, Vec<W, Lanes>));
+  for (int i = 0; i < Vectors; ++i) {
+    store(out + i * Lanes, best[i]);
+    store(winners + i * Lanes, __builtin_convertvector(winner[i], Vec<W, Lanes>));
+  }
 }
 
 template <int Each, class T, class W>
@@ -35,14 +53,17 @@ void max_of_pixel(const T* image, const PoolCorners<T>& corners, int64_t taps, i
                   T* out, W* winners) {
   int32_t fallback = 0;  // the first tap there is
   while (corners.first[fallback] == corners.first[fallback + 1]) ++fallback;
-  constexpr int lanes = kMaxLanes<T>;
+  constexpr int lanes = kMaxLanes<T>, step = lanes * kMaxVectors;
   int64_t c = 0;
+  for (; c + step <= channels; c += step) {
+    max_of_taps<Each, lanes, kMaxVectors>(image + c, corners, taps, fallback, out + c, winners + c);
+  }
   for (; c + lanes <= channels; c += lanes) {
-    max_of_taps<Each, lanes>(image + c, corners, taps, fallback, out + c, winners + c);
+    max_of_taps<Each, lanes, 1>(image + c, corners, taps, fallback, out + c, winners + c);
   }
   if constexpr (lanes > 4) {
     if (c < channels) {
-      max_of_taps<Each, 4>(image + c, corners, taps, fallback, out + c, winners + c);
+      max_of_taps<Each, 4, 1>(image + c, corners, taps, fallback, out + c, winners + c);
     }
   }
 }

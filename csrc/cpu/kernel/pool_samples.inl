@@ -112,8 +112,8 @@ struct PoolCorners {
   int each;  // corners of every tap, 0 where they differ
   T total;   // of the weights
 
-  // One tap more than there are, for winners that name none.
-  static int64_t entries(int64_t taps) { return (taps + 1) * 4; }
+  // One tap more than there are, for winners that name none, and four more entries behind it.
+  static int64_t entries(int64_t taps) { return (taps + 2) * 4; }
   static int64_t need(int64_t taps) {
     return Workspace::need<int64_t>(entries(taps)) + 3 * Workspace::need<T>(entries(taps)) +
            Workspace::need<int32_t>(taps + 2);
