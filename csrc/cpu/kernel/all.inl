@@ -24,6 +24,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "pool_samples.inl"
 #include "pool_images.inl"
 #include "pool_forward.inl"
+#include "pool_gradients.inl"
 #include "pool_backward.inl"
 
 }  // namespace surfconv::cpu::SURFCONV_ISA

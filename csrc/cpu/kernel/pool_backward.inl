@@ -1,63 +1,18 @@
 // The pools' backward. The input's gradient is shared out by channels, the scale's by pixels: no
 // two workers write to one place, and no sum depends on how many there are.
 
-// winners and grad: whole quads of channels.
-template <class T, class W>
-SURFCONV_INLINE void scatter_winners(const PoolCorners<T>& corners, int64_t taps, int64_t channels,
-                                     const T* grad, const W* winners, T* to) {
-  if (corners.each == 1) {
-    for (int64_t c = 0; c < channels; ++c) {
-      const int64_t q = std::min<int64_t>(winners[c], taps);
-      to[corners.offset[q] + c] += corners.weight[q] * grad[c];
-    }
-    return;
-  }
-  // All channels by all taps: which tap has won a channel is random, and so would be branches on
-  // it.
-  const auto scatter = [&](int64_t c, auto width) SURFCONV_INLINED {
-    constexpr int lanes = decltype(width)::lanes;
-    using V = Vec<T, lanes>;
-    using Mask = decltype(V{} > V{});
-    using Number = std::conditional_t<sizeof(T) == 8, int64_t, int32_t>;
-    const V all = load<V>(grad + c);
-    const Mask winner = __builtin_convertvector(load<Vec<W, lanes>>(winners + c), Mask);
-    for (int64_t t = 0; t < taps; ++t) {
-      const Mask won = winner == Mask{} + static_cast<Number>(t);
-      const V share = won ? all : V{};
-      for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
-        T* pixel = to + corners.offset[q] + c;
-        store(pixel, V(load<V>(pixel) + corners.weight[q] * share));
-      }
-    }
-  };
-  constexpr int lanes = kMaxLanes<T>;
-  int64_t c = 0;
-  for (; c + lanes <= channels; c += lanes) scatter(c, Width<lanes>{});
-  if constexpr (lanes > 4) {
-    if (c < channels) scatter(c, Width<4>{});
-  }
+// Calls body(winners of whole quads of channels); numbers: room for them.
+template <class W, class Body>
+SURFCONV_INLINE void with_whole_quads(const W* row, int64_t channels, uint32_t* numbers,
+                                      const Body& body) {
+  if (channels % kQuad == 0) return body(row);
+  // The tensor ends where its last channel does.
+  std::copy_n(row, channels, numbers);
+  std::fill(numbers + channels, numbers + to_quads(channels), 0);
+  body(static_cast<const uint32_t*>(numbers));
 }
 
-// grad is changed: it becomes the gradient of the sum.
-template <class T>
-SURFCONV_INLINE void scatter_average(const PoolCorners<T>& corners, T divisor, int64_t channels,
-                                     T* grad, T* to) {
-  if (divisor == 0) return;
-  for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-    using V = Vec<T, decltype(width)::lanes>;
-    store(grad + c, V(load<V>(grad + c) / divisor));
-  });
-  for (int64_t q = 0; q < corners.count; ++q) {
-    T* pixel = to + corners.offset[q];
-    const T weight = corners.weight[q];
-    for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-      using V = Vec<T, decltype(width)::lanes>;
-      store(pixel + c, V(load<V>(pixel + c) + weight * load<V>(grad + c)));
-    });
-  }
-}
-
-// body(sampler, worker's row of winners, pixel of the tile, flat output pixel with n, first
+// body(sampler, room for a row of winners, pixel of the tile, flat output pixel with n, first
 // channel, channels, gradient of the pixel's channels, where the image's gradient lies)
 template <Edges E, class T, class Body>
 void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const Executor& executor,
@@ -122,13 +77,8 @@ void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const
   });
 }
 
-template <class T>
-struct ScaleGradient {
-  T y = 0, x = 0;
-};
-
-// body(sampler, image, pixel of the tile, flat output pixel with n, gradient of its channels) gives
-// the gradient of (scale_y, scale_x).
+// body(sampler, room for a row of winners, image, pixel of the tile, flat output pixel with n,
+// gradient of its channels) gives the gradient of (scale_y, scale_x).
 template <Edges E, class T, class Body>
 void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const Executor& executor,
                      const Body& body) {
@@ -136,14 +86,17 @@ void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const
   PoolImages<T> images(pool, tensors.input, tensors.guide);
   const int workers = workers_for(executor, pool.batch * pool_tiles(pool),
                                   pool.batch * outputs * padded * pool.taps());
-  const int64_t scratch = PoolSampler<E, T>::need(pool) + Workspace::need<T>(kTile * padded);
+  const int64_t scratch = PoolSampler<E, T>::need(pool) + Workspace::need<T>(kTile * padded) +
+                          Workspace::need<uint32_t>(padded);
   std::vector<Workspace> memory;
   std::vector<PoolSampler<E, T>> samplers;
   std::vector<T*> rows;
+  std::vector<uint32_t*> numbers;
   for (int worker = 0; worker < workers; ++worker) {
     memory.emplace_back(scratch);
     samplers.emplace_back(pool, images.step_y(), images.step_x(), memory.back());
-    rows.push_back(memory.back().take<T>(kTile * padded));
+    rows.push_back(memory.back().template take<T>(kTile * padded));
+    numbers.push_back(memory.back().template take<uint32_t>(padded));
   }
   images.for_groups(executor, [&](int64_t first_image, int64_t count) {
     for_pool_tiles(
@@ -158,7 +111,8 @@ void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const
           for (int64_t m = 0; m < pixels; ++m) {
             sampler.template list<true>(m);
             const ScaleGradient<T> grad =
-                body(sampler, images.image(n), m, n * outputs + first + m, grads + m * padded);
+                body(sampler, numbers[static_cast<size_t>(worker)], images.image(n), m,
+                     n * outputs + first + m, grads + m * padded);
             along_y[m] = pool.scale_components == 1 ? grad.y + grad.x : grad.y;
             along_x[m] = grad.x;
           }
@@ -173,7 +127,7 @@ void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const
 template <class T>
 void max_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
                           const Executor& executor) {
-  const int64_t taps = pool.taps();
+  const int64_t taps = pool.taps(), padded = to_quads(pool.channels);
   visit_winners(tensors.winners, [&](const auto* winners) {
     if (tensors.grad_input.data != nullptr) {
       pool_grad_input<Edges::clamp, T>(
@@ -181,48 +135,25 @@ void max_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
           [&](const auto& sampler, uint32_t* numbers, int64_t, int64_t pixel, int64_t first,
               int64_t channels, const T* grad, T* image) {
             if (sampler.corners.count == 0) return;
-            const auto* row = winners + pixel * pool.channels + first;
-            if (channels % kQuad == 0) {
-              return scatter_winners(sampler.corners, taps, channels, grad, row, image);
-            }
-            // The tensor ends where its last channel does.
-            std::copy_n(row, channels, numbers);
-            std::fill(numbers + channels, numbers + to_quads(channels), 0);
-            scatter_winners(sampler.corners, taps, to_quads(channels), grad, numbers, image);
+            with_whole_quads(
+                winners + pixel * pool.channels + first, channels, numbers, [&](const auto* row) {
+                  scatter_winners(sampler.corners, taps, to_quads(channels), grad, row, image);
+                });
           });
     }
     if (tensors.grad_scale.data == nullptr) return;
     pool_grad_scale<Edges::clamp, T>(
         pool, tensors, executor,
-        [&](const auto& sampler, const T* image, int64_t, int64_t pixel, const T* grad) {
-          const PoolCorners<T>& corners = sampler.corners;
-          double along_y = 0, along_x = 0;
-          for (int64_t c = 0; c < pool.channels; ++c) {
-            const int64_t t = std::min<int64_t>(winners[pixel * pool.channels + c], taps);
-            T slope_y = 0, slope_x = 0;
-            for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
-              const T value = image[corners.offset[q] + c];
-              slope_y += corners.slope_y[q] * value;
-              slope_x += corners.slope_x[q] * value;
-            }
-            along_y += static_cast<double>(slope_y) * static_cast<double>(grad[c]);
-            along_x += static_cast<double>(slope_x) * static_cast<double>(grad[c]);
-          }
-          return ScaleGradient<T>{static_cast<T>(along_y), static_cast<T>(along_x)};
+        [&](const auto& sampler, uint32_t* numbers, const T* image, int64_t, int64_t pixel,
+            const T* grad) {
+          ScaleGradient<T> along;
+          with_whole_quads(
+              winners + pixel * pool.channels, pool.channels, numbers, [&](const auto* row) {
+                along = slopes_of_winners(sampler.corners, taps, padded, grad, row, image);
+              });
+          return along;
         });
   });
-}
-
-template <class T>
-T channel_product(int64_t channels, const T* a, const T* b) {
-  Vec<T, kLanes<T>> sum{};
-  int64_t c = 0;
-  for (; c + kLanes<T> <= channels; c += kLanes<T>) {
-    sum += load<Vec<T, kLanes<T>>>(a + c) * load<Vec<T, kLanes<T>>>(b + c);
-  }
-  T total = sum_lanes<T>(sum);
-  for (; c < channels; ++c) total += a[c] * b[c];
-  return total;
 }
 
 template <class T>
@@ -241,7 +172,7 @@ void avg_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
   const bool weighted = pool.divisor_override == 0 && !pool.count_include_pad;
   pool_grad_scale<Edges::zero, T>(
       pool, tensors, executor,
-      [&](const auto& sampler, const T* image, int64_t m, int64_t, const T* grad) {
+      [&](const auto& sampler, uint32_t*, const T* image, int64_t m, int64_t, const T* grad) {
         const PoolCorners<T>& corners = sampler.corners;
         const T divisor = sampler.divisor(m);
         if (divisor == 0) return ScaleGradient<T>{};
