@@ -65,11 +65,16 @@ def pool_output_size(
 
     In ceil mode a window may reach beyond the padding, but has to start before its far side.
     """
-    room = size + 2 * padding - dilation * (kernel - 1) - 1
+    span = dilation * (kernel - 1)
+    room = size + 2 * padding - span - 1
     if not ceil_mode:
         return room // stride + 1
-    count = (room + stride - 1) // stride + 1
-    return count - 1 if (count - 1) * stride >= size + padding else count
+    last = (room + stride - 1) // stride
+    # No window starts too late where a stride takes it no further than the kernel reaches. Asking
+    # the size would tie an exported net to it.
+    if stride + padding > span + 1:
+        last = torch.sym_min(last, (size + padding - 1) // stride)
+    return last + 1
 
 
 def pool_window_sizes(

@@ -16,10 +16,10 @@ from torch import Tensor
 from . import pool_reference
 from ._fallback import warn_once
 from ._loader import missing_library_reason
+from .geometry import Pair
 from .layout import lay_out, memory_format_of
 from .ops import Library
 from .vmap import fold, unfold
-
 
 _TENSORS = "Tensor input, Tensor scale, Tensor? guide, "
 _MAX_OPTIONS = (
@@ -61,7 +61,7 @@ def _laid_out(
 ) -> tuple[Tensor, Tensor]:
     # An operator's results may not share memory: each that is not needed is a tensor of its own.
     grad_input, grad_scale = (
-        lay_out(grad, memory_format_of(model)) if need else input.new_empty(0)
+        lay_out(grad, memory_format_of(model)) if need else model.new_empty(0)
         for grad, model, need in zip(grads, (input, scale), needs, strict=True)
     )
     return grad_input, grad_scale
@@ -128,7 +128,7 @@ def _fake_backward(
     empty = [
         model.new_empty(model.shape).contiguous(memory_format=memory_format_of(model))
         if need
-        else input.new_empty(0)
+        else model.new_empty(0)
         for model, need in zip((input, scale), rest[-2:], strict=True)
     ]
     return empty[0], empty[1]
@@ -136,9 +136,8 @@ def _fake_backward(
 
 def _save_max(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     input, scale, guide, *options = inputs
-    winner = output[1]
-    ctx.mark_non_differentiable(winner)
-    ctx.save_for_backward(input, scale, guide, winner)
+    ctx.mark_non_differentiable(output[1])
+    ctx.save_for_backward(input, scale, guide, output[1])
     ctx.options = options
 
 
@@ -216,12 +215,31 @@ def _map_backward(
     return tuple(unfolded), tuple(0 if need else None for need in needs)
 
 
+# Arguments one by one: TorchDynamo 2.13 hands its context to a forward that takes ``*args``.
 class SurfMaxPool2dFunction(torch.autograd.Function):
     """The maximum and its winners; its backward is :class:`SurfMaxPool2dBackwardFunction`."""
 
     @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, Tensor]:
-        result: tuple[Tensor, Tensor] = _max_op(*args)
+    def forward(
+        input: Tensor,
+        scale: Tensor,
+        guide: Tensor | None,
+        guide_tolerance: float,
+        kernel_size: Pair,
+        stride: Pair,
+        padding: Pair,
+        dilation: Pair,
+    ) -> tuple[Tensor, Tensor]:
+        result: tuple[Tensor, Tensor] = _max_op(
+            input,
+            scale,
+            guide,
+            guide_tolerance,
+            kernel_size,
+            stride,
+            padding,
+            dilation,
+        )
         return result
 
     @staticmethod
@@ -241,8 +259,34 @@ class SurfMaxPool2dBackwardFunction(torch.autograd.Function):
     """The maximum's backward operator; its backward runs the reference's formula."""
 
     @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, Tensor]:
-        grads: tuple[Tensor, Tensor] = _max_backward_op(*args)
+    def forward(
+        grad_output: Tensor,
+        input: Tensor,
+        scale: Tensor,
+        guide: Tensor | None,
+        winner: Tensor,
+        guide_tolerance: float,
+        kernel_size: Pair,
+        stride: Pair,
+        padding: Pair,
+        dilation: Pair,
+        need_input: bool,
+        need_scale: bool,
+    ) -> tuple[Tensor, Tensor]:
+        grads: tuple[Tensor, Tensor] = _max_backward_op(
+            grad_output,
+            input,
+            scale,
+            guide,
+            winner,
+            guide_tolerance,
+            kernel_size,
+            stride,
+            padding,
+            dilation,
+            need_input,
+            need_scale,
+        )
         return grads
 
     @staticmethod
@@ -262,8 +306,28 @@ class SurfAvgPool2dFunction(torch.autograd.Function):
     """The average; its backward is :class:`SurfAvgPool2dBackwardFunction`."""
 
     @staticmethod
-    def forward(*args: Any) -> Tensor:
-        output: Tensor = _avg_op(*args)
+    def forward(
+        input: Tensor,
+        scale: Tensor,
+        guide: Tensor | None,
+        guide_tolerance: float,
+        kernel_size: Pair,
+        stride: Pair,
+        padding: Pair,
+        count_include_pad: bool,
+        divisor_override: int,
+    ) -> Tensor:
+        output: Tensor = _avg_op(
+            input,
+            scale,
+            guide,
+            guide_tolerance,
+            kernel_size,
+            stride,
+            padding,
+            count_include_pad,
+            divisor_override,
+        )
         return output
 
     @staticmethod
@@ -283,8 +347,34 @@ class SurfAvgPool2dBackwardFunction(torch.autograd.Function):
     """The average's backward operator; its backward runs the reference's formula."""
 
     @staticmethod
-    def forward(*args: Any) -> tuple[Tensor, Tensor]:
-        grads: tuple[Tensor, Tensor] = _avg_backward_op(*args)
+    def forward(
+        grad_output: Tensor,
+        input: Tensor,
+        scale: Tensor,
+        guide: Tensor | None,
+        guide_tolerance: float,
+        kernel_size: Pair,
+        stride: Pair,
+        padding: Pair,
+        count_include_pad: bool,
+        divisor_override: int,
+        need_input: bool,
+        need_scale: bool,
+    ) -> tuple[Tensor, Tensor]:
+        grads: tuple[Tensor, Tensor] = _avg_backward_op(
+            grad_output,
+            input,
+            scale,
+            guide,
+            guide_tolerance,
+            kernel_size,
+            stride,
+            padding,
+            count_include_pad,
+            divisor_override,
+            need_input,
+            need_scale,
+        )
         return grads
 
     @staticmethod

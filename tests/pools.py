@@ -152,7 +152,9 @@ def make(
     rng = np.random.default_rng(seed)
     options = {"kernel_size": kernel, "stride": stride, "padding": padding, "ceil_mode": ceil_mode}
     options |= others
-    window = {k: v for k, v in options.items() if k not in ("count_include_pad", "divisor_override")}
+    window = {
+        k: v for k, v in options.items() if k not in ("count_include_pad", "divisor_override")
+    }
     out_size = torch.nn.functional.max_pool2d(torch.zeros(1, 1, *size), **window).shape[2:]
     kind = compute_dtype(dtype) if scale_dtype is None else scale_dtype
     x = torch.from_numpy(rng.standard_normal((batch, channels, *size))).to(dtype)
