@@ -42,6 +42,12 @@ struct Axis {
   int64_t fixed_tap() const { return kernel % 2 != 0 ? kernel / 2 : -1; }
   bool fixed(int64_t t) const { return t == fixed_tap(); }
 
+  // Pixels under window o of a pool, padding included, what a window reaches beyond it not.
+  int64_t pool_window(int64_t o) const {
+    const int64_t start = stride * o - padding;
+    return std::min(start + kernel, in + padding) - start;
+  }
+
   // Largest magnitude a centre or an image border takes: decides the width of index arithmetic.
   int64_t reach() const {
     return std::max(in, stride * std::max<int64_t>(out, 1) + padding + dilation * kernel);

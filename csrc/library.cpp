@@ -5,6 +5,7 @@
 #include "depth_to_scale.h"
 #include "level_values.h"
 #include "surf_conv2d.h"
+#include "surf_pool2d.h"
 
 STABLE_TORCH_LIBRARY(surfconv, m) {
   m.def(
@@ -22,6 +23,22 @@ STABLE_TORCH_LIBRARY(surfconv, m) {
   m.def(
       "depth_to_scale_backward(Tensor grad, Tensor depth, float reference_depth, float low, "
       "float high, float steepest) -> Tensor");
+  m.def(
+      "surf_max_pool2d(Tensor input, Tensor scale, Tensor? guide, float guide_tolerance, "
+      "int[] kernel_size, int[] stride, int[] padding, int[] dilation) -> (Tensor, Tensor)");
+  m.def(
+      "surf_max_pool2d_backward(Tensor grad_output, Tensor input, Tensor scale, Tensor? guide, "
+      "Tensor winner, float guide_tolerance, int[] kernel_size, int[] stride, int[] padding, "
+      "int[] dilation, bool need_input, bool need_scale) -> (Tensor, Tensor)");
+  m.def(
+      "surf_avg_pool2d(Tensor input, Tensor scale, Tensor? guide, float guide_tolerance, "
+      "int[] kernel_size, int[] stride, int[] padding, bool count_include_pad, "
+      "int divisor_override) -> Tensor");
+  m.def(
+      "surf_avg_pool2d_backward(Tensor grad_output, Tensor input, Tensor scale, Tensor? guide, "
+      "float guide_tolerance, int[] kernel_size, int[] stride, int[] padding, "
+      "bool count_include_pad, int divisor_override, bool need_input, bool need_scale) "
+      "-> (Tensor, Tensor)");
   m.def("cpu_capability() -> str");
 }
 
@@ -31,6 +48,10 @@ STABLE_TORCH_LIBRARY_IMPL(surfconv, CPU, m) {
   m.impl("level_values", TORCH_BOX(&surfconv::level_values));
   m.impl("depth_to_scale", TORCH_BOX(&surfconv::depth_to_scale));
   m.impl("depth_to_scale_backward", TORCH_BOX(&surfconv::depth_to_scale_backward));
+  m.impl("surf_max_pool2d", TORCH_BOX(&surfconv::surf_max_pool2d));
+  m.impl("surf_max_pool2d_backward", TORCH_BOX(&surfconv::surf_max_pool2d_backward));
+  m.impl("surf_avg_pool2d", TORCH_BOX(&surfconv::surf_avg_pool2d));
+  m.impl("surf_avg_pool2d_backward", TORCH_BOX(&surfconv::surf_avg_pool2d_backward));
 }
 
 STABLE_TORCH_LIBRARY_IMPL(surfconv, CompositeExplicitAutograd, m) {

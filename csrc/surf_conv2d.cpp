@@ -1,62 +1,13 @@
 #include "surf_conv2d.h"
 
 #include <torch/csrc/stable/ops.h>
-#include <torch/headeronly/core/MemoryFormat.h>
-#include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
 #include "cpu/surf_conv2d.h"
+#include "tensors.h"
 
 namespace surfconv {
 namespace {
-
-using cpu::DType;
-using cpu::View;
-using torch::headeronly::MemoryFormat;
-using torch::headeronly::ScalarType;
-
-DType dtype_of(const Tensor& tensor, const char* name) {
-  switch (tensor.scalar_type()) {
-    case ScalarType::Float:
-      return DType::f32;
-    case ScalarType::Double:
-      return DType::f64;
-    case ScalarType::BFloat16:
-      return DType::bf16;
-    case ScalarType::Half:
-      return DType::f16;
-    default:
-      STD_TORCH_CHECK(false, "surf_conv2d: ", name,
-                      " must be float32, float64, bfloat16 or float16");
-  }
-  return DType::f32;
-}
-
-View view_of(const Tensor& tensor, const char* name, bool written = false) {
-  View view;
-  // The kernels only read what is not written; the const pointer leaves a lazy copy lazy.
-  view.data = written ? tensor.mutable_data_ptr() : const_cast<void*>(tensor.const_data_ptr());
-  view.dtype = dtype_of(tensor, name);
-  const auto strides = tensor.strides();
-  switch (tensor.dim()) {
-    case 4:
-      view.n = strides[0], view.c = strides[1], view.y = strides[2], view.x = strides[3];
-      break;
-    case 3:  // a guide
-      view.n = strides[0], view.y = strides[1], view.x = strides[2];
-      break;
-    default:  // a bias
-      view.c = strides[0];
-  }
-  return view;
-}
-
-void check_scale_like(const Tensor& tensor, const Tensor& input, const char* name) {
-  const DType dtype = dtype_of(tensor, name);
-  STD_TORCH_CHECK(dtype == DType::f32 || dtype == dtype_of(input, "input"), "surf_conv2d: ", name,
-                  " must be float32 or have the input's dtype");
-  STD_TORCH_CHECK(tensor.is_cpu(), "surf_conv2d: ", name, " must be on the CPU");
-}
 
 // What memory safety needs; the messages a user should see come from the Python validator.
 cpu::Conv checked(const Tensor& input, const Tensor& weight, const Tensor& scale,
@@ -82,52 +33,12 @@ cpu::Conv checked(const Tensor& input, const Tensor& weight, const Tensor& scale
                         guide->size(1) == input.size(2) && guide->size(2) == input.size(3),
                     "surf_conv2d: guide must be (N, H, W)");
   }
-  const auto axis = [&](int64_t d) {
-    constexpr int64_t kMost = int64_t{1} << 40;
-    const int64_t size = input.size(2 + d), kernel = weight.size(2 + d);
-    STD_TORCH_CHECK(size > 0 && kernel > 0, "surf_conv2d: empty image or kernel");
-    STD_TORCH_CHECK(stride[d] > 0 && dilation[d] > 0 && padding[d] >= 0,
-                    "surf_conv2d: stride and dilation must be positive, padding not negative");
-    STD_TORCH_CHECK(dilation[d] < kMost / kernel && padding[d] < kMost &&
-                        stride[d] < kMost / (scale.size(2 + d) + 1),
-                    "surf_conv2d: stride, padding or dilation out of range");
-    return Axis{size, scale.size(2 + d), kernel, stride[d], padding[d], dilation[d]};
+  const auto axis = [&](size_t d) {
+    return checked_axis(input.size(2 + d), scale.size(2 + d), weight.size(2 + d), stride[d],
+                        padding[d], dilation[d]);
   };
   return {axis(0),        axis(1), input.size(0), input.size(1),
           weight.size(0), groups,  scale.size(1), guide_tolerance};
-}
-
-bool channels_last(const Tensor& tensor) {
-  if (tensor.dim() != 4 || tensor.is_contiguous()) return false;
-  const int64_t order[] = {1, 3, 2, 0};
-  int64_t expected = 1;
-  for (int64_t d : order) {
-    if (tensor.size(d) != 1 && tensor.stride(d) != expected) return false;
-    expected *= tensor.size(d);
-  }
-  return true;
-}
-
-Tensor empty_as(const Tensor& like, const std::vector<int64_t>& sizes, const Tensor& layout) {
-  const auto format = channels_last(layout) ? MemoryFormat::ChannelsLast : MemoryFormat::Contiguous;
-  return torch::stable::empty(sizes, like.scalar_type(), std::nullopt, std::nullopt, std::nullopt,
-                              format);
-}
-
-Tensor absent(const Tensor& like) { return torch::stable::empty({0}, like.scalar_type()); }
-
-std::vector<int64_t> sizes_of(const Tensor& tensor) {
-  const auto sizes = tensor.sizes();
-  return {sizes.begin(), sizes.end()};
-}
-
-cpu::Executor executor() {
-  const auto run = [](int workers, void (*body)(void*, int), void* context) {
-    torch::stable::parallel_for(0, workers, 1, [&](int64_t begin, int64_t end) {
-      for (int64_t worker = begin; worker < end; ++worker) body(context, static_cast<int>(worker));
-    });
-  };
-  return {static_cast<int>(torch::stable::get_num_threads()), run};
 }
 
 }  // namespace

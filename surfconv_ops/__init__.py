@@ -10,6 +10,8 @@ from .guided import DepthGuided
 from .levels import DepthLevels
 from .metrics import SegmentationMetrics
 from .modules import SurfConv2d
+from .pool_functional import surf_avg_pool2d, surf_max_pool2d
+from .pools import SurfAvgPool2d, SurfMaxPool2d
 from .pyramid import SurfConvPyramid
 
 __version__ = "0.1.0"
@@ -19,8 +21,10 @@ __all__ = [
     "DepthGuided",
     "DepthLevels",
     "SegmentationMetrics",
+    "SurfAvgPool2d",
     "SurfConv2d",
     "SurfConvPyramid",
+    "SurfMaxPool2d",
     "__version__",
     "at_output_centers",
     "conversion_report",
@@ -28,5 +32,7 @@ __all__ = [
     "depth_to_scale",
     "fit_depth_levels",
     "reference",
+    "surf_avg_pool2d",
     "surf_conv2d",
+    "surf_max_pool2d",
 ]

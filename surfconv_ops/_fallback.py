@@ -28,7 +28,7 @@ LEVEL_VALUES_SCHEMA = "level_values(Tensor depth, Tensor edges, Tensor values) -
 _warned = False
 
 
-def _warn_once(device: torch.device) -> None:
+def warn_once(device: torch.device) -> None:
     global _warned
     if _warned:
         return
@@ -43,7 +43,7 @@ def _warn_once(device: torch.device) -> None:
             " `pip install --no-build-isolation .` (or `make build`) in the source folder"
         )
     warnings.warn(
-        f"surfconv_ops: {reason}, so surf_conv2d runs the plain PyTorch reference, which is many"
+        f"surfconv_ops: {reason}, so it runs its plain PyTorch reference, which is many"
         f" times slower. For the fast path, {remedy}. This is said once.",
         RuntimeWarning,
         stacklevel=3,
@@ -62,7 +62,7 @@ def _forward(
     dilation: Pair,
     groups: int,
 ) -> Tensor:
-    _warn_once(input.device)
+    warn_once(input.device)
     output = reference.forward(
         input, weight, bias, scale, guide, guide_tolerance, stride, padding, dilation, groups
     )
@@ -85,7 +85,7 @@ def _backward(
     need_bias: bool,
     need_scale: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    _warn_once(input.device)
+    warn_once(input.device)
     grads = reference.backward(
         grad_output,
         input,

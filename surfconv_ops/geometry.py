@@ -63,6 +63,33 @@ def output_size(size: int, kernel: int, stride: int, padding: Pair, dilation: in
     return (size + padding[0] + padding[1] - dilation * (kernel - 1) - 1) // stride + 1
 
 
+def pool_output_size(
+    size: int, kernel: int, stride: int, padding: int, dilation: int, ceil_mode: bool
+) -> int:
+    """Number of output pixels of a pool along an axis, as nn's pools count them.
+
+    In ceil mode a window may reach beyond the padding, but has to start before its far side.
+    """
+    span = dilation * (kernel - 1)
+    room = size + 2 * padding - span - 1
+    if not ceil_mode:
+        return room // stride + 1
+    last = (room + stride - 1) // stride
+    # No window starts too late where a stride takes it no further than the kernel reaches. Asking
+    # the size would tie an exported net to it.
+    if stride + padding > span + 1:
+        last = torch.sym_min(last, (size + padding - 1) // stride)
+    return last + 1
+
+
+def pool_window_sizes(
+    size: int, count: int, kernel: int, stride: int, padding: int, device: torch.device | None
+) -> Tensor:
+    """Pixels of an axis under each window, padding included, what lies beyond it not."""
+    start = torch.arange(count, device=device) * stride - padding
+    return (start + kernel).clamp(max=size + padding) - start
+
+
 def reference_depth_of_radius(
     radius: float, focal_length: float, kernel: int, dilation: int
 ) -> float:

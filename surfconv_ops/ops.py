@@ -27,7 +27,7 @@ _BACKWARD = "surfconv::surf_conv2d_backward"
 _AUTOCAST_KEYS = {"AutocastCPU": "cpu", "AutocastCUDA": "cuda"}
 
 
-class _Library(torch.library.Library):
+class Library(torch.library.Library):
     """A library whose derivatives refuse forward mode.
 
     What register_autograd makes is skipped where nothing requires a gradient, and would lose a
@@ -52,7 +52,7 @@ class _Library(torch.library.Library):
 
 
 # Kept for the life of the process: what it registered goes when it goes.
-_library = _Library("surfconv", "FRAGMENT")
+_library = Library("surfconv", "FRAGMENT")
 _fallback.register(_library)
 depth_ops.register(_library)
 _forward_op = torch.ops.surfconv.surf_conv2d.default

@@ -23,8 +23,8 @@ class Corner(NamedTuple):
     visible: Tensor
     weight_y: Tensor
     weight_x: Tensor
-    slope_y: int  # derivative of weight_y with respect to the sample's row
-    slope_x: int
+    slope_y: int | Tensor  # derivative of weight_y with respect to the sample's row
+    slope_x: int | Tensor
 
 
 class Tap(NamedTuple):
@@ -43,7 +43,11 @@ class _AxisCorner(NamedTuple):
     pixel: Tensor
     inside: Tensor
     weight: Tensor
-    slope: int
+    slope: int | Tensor
+
+    @property
+    def flat_slope(self) -> int | Tensor:
+        return self.slope if isinstance(self.slope, int) else self.slope.flatten(1)
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,47 @@ class _Axis:
         return _AxisCorner(pixel.clamp(0, self.size - 1), inside, weight, slope)
 
 
-class _Guide:
+class _ClampedAxis(_Axis):
+    """An axis whose samples are clamped into the image, as a maximum takes them.
+
+    Where the scale is exactly 1, taps outside the image are left out instead, as nn's pools do:
+    clamped, they would see pixels between the taps of a dilated kernel.
+    """
+
+    def corners(self, tap: int) -> list[_AxisCorner]:
+        offset = self.offset(tap)
+        scale = self.scale.detach()
+        last = self.size - 1
+        if offset == 0:
+            # Selecting nothing of the scale keeps it in the graph, with a gradient of zero.
+            low = self.centre.expand(scale.shape)
+            fraction = torch.where(torch.ones_like(scale, dtype=torch.bool), 0.0, self.scale)
+            inside = torch.ones_like(low, dtype=torch.bool)
+            before, behind = low < 0, low >= last
+        else:
+            inside = scale.isfinite()
+            far = scale * offset
+            safe = torch.where(far.abs() <= _REACH, self.scale, 0.0)
+            position = geometry.centre_fraction(self.kernel, self.dilation) + safe * offset
+            at = position.detach()
+            whole = at.floor() if offset > 0 else at.ceil() - 1
+            low = self.centre + whole.to(torch.int64)
+            fraction = position - whole
+            before = (far < -_REACH) | ((far.abs() <= _REACH) & (low < 0))
+            behind = (far > _REACH) | ((far.abs() <= _REACH) & (low >= last))
+        pixel = low + (fraction.detach() == 1)
+        inside = inside & ((scale != 1) | ((pixel >= 0) & (pixel <= last)))
+        clamped = before | behind
+        low = torch.where(before, 0, torch.where(behind, last, low)).clamp(0, last)
+        fraction = torch.where(clamped, 0.0, fraction)
+        moves = (~clamped).to(scale.dtype)
+        return [
+            _AxisCorner(low, inside, 1 - fraction, -moves),
+            _AxisCorner((low + 1).clamp(max=last), inside & ~clamped, fraction, moves),
+        ]
+
+
+class Guide:
     """What every output pixel may see: pixels whose guide is within tolerance of its centre's."""
 
     def __init__(self, guide: Tensor, tolerance: float, rows: Tensor, columns: Tensor) -> None:
@@ -108,6 +152,19 @@ class _Guide:
         return near | ~self._applies
 
 
+def centres(
+    scale: Tensor, kernel: Pair, stride: Pair, padding: Pair, dilation: Pair
+) -> tuple[Tensor, Tensor]:
+    """Integer parts of all centres: (Ho, 1) rows and (1, Wo) columns."""
+    rows, columns = (
+        geometry.centre_pixels(
+            scale.shape[i + 2], kernel[i], stride[i], padding[i], dilation[i], scale.device
+        )
+        for i in (0, 1)
+    )
+    return rows[:, None], columns[None, :]
+
+
 def taps(
     size: Pair,
     kernel: Pair,
@@ -117,19 +174,17 @@ def taps(
     stride: Pair,
     padding: Pair,
     dilation: Pair,
+    clamped: bool = False,
 ) -> Iterator[Tap]:
-    """Every tap of the kernel in row order; ``scale`` and ``guide`` in the compute dtype."""
-    counts = scale.shape[-2:]
-    centres = [
-        geometry.centre_pixels(
-            counts[i], kernel[i], stride[i], padding[i], dilation[i], scale.device
-        )
-        for i in (0, 1)
-    ]
-    rows, columns = centres[0][:, None], centres[1][None, :]
-    axis_y = _Axis(size[0], kernel[0], dilation[0], rows, scale[:, 0])
-    axis_x = _Axis(size[1], kernel[1], dilation[1], columns, scale[:, -1])
-    limits = None if guide is None else _Guide(guide, guide_tolerance, rows, columns)
+    """Every tap of the kernel in row order; ``scale`` and ``guide`` in the compute dtype.
+
+    ``clamped``: samples outside the image move to its edge, else nothing is seen there.
+    """
+    rows, columns = centres(scale, kernel, stride, padding, dilation)
+    axis = _ClampedAxis if clamped else _Axis
+    axis_y = axis(size[0], kernel[0], dilation[0], rows, scale[:, 0])
+    axis_x = axis(size[1], kernel[1], dilation[1], columns, scale[:, -1])
+    limits = None if guide is None else Guide(guide, guide_tolerance, rows, columns)
     for row in range(kernel[0]):
         ends_y = axis_y.corners(row)
         for column in range(kernel[1]):
@@ -141,7 +196,8 @@ def taps(
                     if limits is not None:
                         visible = visible & limits.visible(index)
                     weights = y.weight.flatten(1), x.weight.flatten(1)
-                    corners.append(Corner(index, visible, *weights, y.slope, x.slope))
+                    slopes = y.flat_slope, x.flat_slope
+                    corners.append(Corner(index, visible, *weights, *slopes))
             yield Tap(row, column, axis_y.offset(row), axis_x.offset(column), corners)
 
 

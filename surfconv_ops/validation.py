@@ -135,7 +135,8 @@ def check_surf_conv2d(
 
     ``window`` is what :func:`check_window` gave for the input's size, where that is known already.
     """
-    _check_tensors(input, weight, bias, scale, guide)
+    others = {"weight": weight, "scale": scale, "bias": bias, "guide": guide}
+    check_tensors(input, others, optional=("bias", "guide"))
     groups = check_integer(groups, "groups", 1)
     if input.ndim not in (3, 4):
         raise ValueError(f"input: expected (N, C, H, W) or (C, H, W), got {_shape(input)}")
@@ -145,9 +146,9 @@ def check_surf_conv2d(
     if window is None or window.kernel != kernel:
         size = (input.shape[-2], input.shape[-1])
         window = check_window(size, kernel, stride, padding, dilation, kernel_name="weight")
-    _check_scale(scale, input, window)
+    check_scale(scale, input, window)
     if guide is not None:
-        _check_guide(guide, input)
+        check_guide(guide, input)
     tolerance = check_not_negative(guide_tolerance, "guide_tolerance")
     if not batched:
         input, scale = input.unsqueeze(0), scale.unsqueeze(0)
@@ -169,22 +170,16 @@ def check_surf_conv2d(
     return arguments, batched
 
 
-def _check_tensors(input: Any, weight: Any, bias: Any, scale: Any, guide: Any) -> None:
-    """Types, dtypes and devices."""
-    named = (
-        ("input", input),
-        ("weight", weight),
-        ("scale", scale),
-        ("bias", bias),
-        ("guide", guide),
-    )
-    for name, tensor in named:
-        if not isinstance(tensor, Tensor) and not (tensor is None and name in ("bias", "guide")):
+def check_tensors(input: Any, others: dict[str, Any], optional: tuple[str, ...] = ()) -> None:
+    """Types, dtypes and devices of input and of the arguments that go with it, by name."""
+    named = {"input": input, **others}
+    for name, tensor in named.items():
+        if not isinstance(tensor, Tensor) and not (tensor is None and name in optional):
             raise TypeError(f"{name}: expected a tensor, got {type_name(tensor)}")
     dtype, device = input.dtype, input.device
     if dtype not in FLOAT_DTYPES:
         raise TypeError(f"input: expected one of {_names(FLOAT_DTYPES)}, got {dtype}")
-    for name, tensor in named:
+    for name, tensor in named.items():
         if tensor is None:
             continue
         if tensor.dtype != dtype:
@@ -228,7 +223,7 @@ def _check_channels(input: Tensor, weight: Tensor, bias: Tensor | None, groups: 
         )
 
 
-def _check_scale(scale: Tensor, input: Tensor, window: Window) -> None:
+def check_scale(scale: Tensor, input: Tensor, window: Window) -> None:
     lead = tuple(input.shape[:-3])
     if tuple(scale.shape) == (*lead, 1, *window.output):
         return
@@ -241,7 +236,7 @@ def _check_scale(scale: Tensor, input: Tensor, window: Window) -> None:
         )
 
 
-def _check_guide(guide: Tensor, input: Tensor) -> None:
+def check_guide(guide: Tensor, input: Tensor) -> None:
     expected = (*input.shape[:-3], *input.shape[-2:])
     if tuple(guide.shape) != expected:
         raise ValueError(

@@ -23,9 +23,9 @@ def vmap_forward(
     input, weight, bias, scale, guide, *options = args
     _, weight_dim, bias_dim, *_ = in_dims
     if weight_dim is None and bias_dim is None:
-        folded = [_fold(args[i], in_dims[i], size) for i in (0, 3, 4)]
+        folded = [fold(args[i], in_dims[i], size) for i in (0, 3, 4)]
         output = call(folded[0], weight, bias, folded[1], folded[2], *options)
-        return _unfold(output, size), 0
+        return unfold(output, size), 0
     outputs = [call(*_pick(args, in_dims, i)) for i in range(size)]
     return torch.stack(outputs), 0
 
@@ -39,9 +39,9 @@ def vmap_backward(
     _, need_weight, need_bias, _ = needs
     out_dims = tuple(0 if need else None for need in needs)
     if in_dims[2] is None and not need_weight and not need_bias:
-        folded = [_fold(args[i], in_dims[i], size) for i in (0, 1, 3, 4)]
+        folded = [fold(args[i], in_dims[i], size) for i in (0, 1, 3, 4)]
         grads = call(folded[0], folded[1], weight, folded[2], folded[3], *rest)
-        unfolded = [_unfold(g, size) if need else g for g, need in zip(grads, needs, strict=True)]
+        unfolded = [unfold(g, size) if need else g for g, need in zip(grads, needs, strict=True)]
         return tuple(unfolded), out_dims
     samples = [call(*_pick(args, in_dims, i)) for i in range(size)]
     stacked = [
@@ -51,7 +51,7 @@ def vmap_backward(
     return tuple(stacked), out_dims
 
 
-def _fold(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
+def fold(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
     """(N, ...) with a mapped dimension somewhere or nowhere, as (size * N, ...)."""
     if tensor is None:
         return None
@@ -59,7 +59,7 @@ def _fold(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
     return spread.flatten(0, 1)
 
 
-def _unfold(tensor: Tensor, size: int) -> Tensor:
+def unfold(tensor: Tensor, size: int) -> Tensor:
     return tensor.reshape(size, tensor.shape[0] // size, *tensor.shape[1:])
 
 

@@ -18,7 +18,7 @@
 namespace surfconv::cpu {
 
 extern const Kernels kernels_avx2;
-const Kernels kernels_avx2 = {"avx2", avx2_isa::forward, avx2_isa::backward};
+const Kernels kernels_avx2 = {"avx2", avx2_isa::forward, avx2_isa::backward, &avx2_isa::pool_kernels};
 
 }  // namespace surfconv::cpu
 

@@ -18,7 +18,7 @@
 namespace surfconv::cpu {
 
 extern const Kernels kernels_avx512;
-const Kernels kernels_avx512 = {"avx512", avx512_isa::forward, avx512_isa::backward};
+const Kernels kernels_avx512 = {"avx512", avx512_isa::forward, avx512_isa::backward, &avx512_isa::pool_kernels};
 
 }  // namespace surfconv::cpu
 

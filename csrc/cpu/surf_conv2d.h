@@ -49,10 +49,13 @@ struct Executor {
   void (*run)(int workers, void (*body)(void* context, int worker), void* context);
 };
 
+struct PoolKernels;
+
 struct Kernels {
   const char* name;
   void (*forward)(const Conv&, const ForwardTensors&, const Executor&);
   void (*backward)(const Conv&, const BackwardTensors&, const Executor&);
+  const PoolKernels* pools;
 };
 
 // One entry per instruction set that was compiled and that this processor runs, weakest first:

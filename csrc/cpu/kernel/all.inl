@@ -24,6 +24,11 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "pointwise_backward.inl"
 #include "backward_tile.inl"
 #include "backward.inl"
+#include "pool_samples.inl"
+#include "pool_images.inl"
+#include "pool_forward.inl"
+#include "pool_gradients.inl"
+#include "pool_backward.inl"
 
 }  // namespace surfconv::cpu::SURFCONV_ISA
 

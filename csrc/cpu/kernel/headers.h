@@ -6,9 +6,11 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <type_traits>
 #include <utility>
 #include <vector>
 
 #include "../memory.h"
 #include "../surf_conv2d.h"
+#include "../surf_pool2d.h"

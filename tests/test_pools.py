@@ -1,0 +1,310 @@
+"""Values and gradients of the pools against the oracle, and scale 1 against nn."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import oracle_pools
+from helpers import DTYPES, GUIDES, LAYOUTS, SCALES, assert_same_bits
+from operators import name_of
+from pools import CASES, MAXIMA, Problem, make
+from surfconv_ops import surf_avg_pool2d, surf_max_pool2d
+
+MODES = ("max", "avg")
+# Patterns whose samples lie on pixels, or within rounding of one: there slopes have two sides.
+ON_PIXELS = ("ones", "integers", "zero", "mixed", "tiny", "smooth")
+pytestmark = pytest.mark.core
+each_mode = pytest.mark.parametrize("mode", MODES)
+both_counts = pytest.mark.parametrize("count_include_pad", [True, False])
+
+
+@pytest.mark.parametrize("case", CASES, ids=name_of)
+@pytest.mark.parametrize("axes", [1, 2])
+def test_geometry(case: dict[str, Any], axes: int) -> None:
+    problem = make(**case, axes=axes)
+    problem.check_forward()
+    problem.check_gradients()
+
+
+@pytest.mark.parametrize("case", CASES, ids=name_of)
+@pytest.mark.parametrize("scale", SCALES)
+def test_scale(case: dict[str, Any], scale: str) -> None:
+    problem = make(**case, scale=scale, batch=1, axes=2)
+    problem.check_forward()
+    problem.check_gradients(scale=scale not in ON_PIXELS)
+
+
+@each_mode
+@both_counts
+@pytest.mark.parametrize("kernel", [2, 3, (2, 3)])
+@pytest.mark.parametrize("guide", GUIDES[1:])
+@pytest.mark.parametrize("tolerance", [0.0, 0.8])
+def test_guide(
+    mode: str, count_include_pad: bool, kernel: Any, guide: str, tolerance: float
+) -> None:
+    others = {} if mode == "max" else {"count_include_pad": count_include_pad}
+    problem = make(mode, kernel=kernel, stride=1, guide=guide, guide_tolerance=tolerance,
+                   dtype=torch.float64, **others)  # fmt: skip
+    problem.check_forward()
+    problem.check_gradients()
+    blind = replace(problem, guide=None)
+    assert guide == "nan" or not torch.equal(problem.run(), blind.run())
+
+
+@each_mode
+@pytest.mark.parametrize("channels", [1, 3, 4, 5, 8, 17, 36, 70])
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
+def test_channels(mode: str, channels: int, layout: str) -> None:
+    problem = make(mode, 1, channels, (5, 6), layout=layout, axes=2)
+    problem.check_forward()
+    problem.check_gradients()
+
+
+@each_mode
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+@pytest.mark.parametrize("channels", [5, 16])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_dtype_and_layout(mode: str, dtype: torch.dtype, channels: int, layout: str) -> None:
+    problem = make(mode, channels=channels, dtype=dtype, layout=layout)
+    problem.check_forward()
+    half = dtype in (torch.bfloat16, torch.float16)
+    if not (half and layout == "expanded"):
+        problem.check_gradients()
+    last = layout == "channels_last"
+    out = problem.run()
+    wanted = torch.channels_last if last else torch.contiguous_format
+    assert out.is_contiguous(memory_format=wanted)
+    grads = problem.gradients(torch.ones_like(out))
+    assert grads["input"].is_contiguous(memory_format=wanted) and grads["scale"].is_contiguous()
+
+
+@each_mode
+def test_scale_in_half_types(mode: str) -> None:
+    for dtype in (torch.bfloat16, torch.float16):
+        problem = make(mode, dtype=dtype, scale_dtype=dtype, guide="levels")
+        problem.check_forward()
+        assert problem.gradients(problem.run())["scale"].dtype == dtype
+
+
+@each_mode
+@pytest.mark.parametrize("kernel", [17, (16, 16), (1, 300)])
+def test_more_taps_than_eight_bits_number(mode: str, kernel: Any) -> None:
+    problem = make(mode, 1, 2, (20, 300), kernel=kernel, stride=(3, 40), padding=0, axes=2,
+                   dtype=torch.float64)  # fmt: skip
+    problem.check_forward()
+    problem.check_gradients()
+
+
+@pytest.mark.parametrize("kernel", [(5, 51), (16, 16)])
+def test_numbers_of_winners(kernel: tuple[int, int]) -> None:
+    """255 taps and the number that means none fit 8 bits."""
+    x = torch.arange(51.0 * 16).reshape(1, 1, 16, 51)
+    scale = torch.ones(1, 1, 16 - kernel[0] + 1, 51 - kernel[1] + 1)
+    _, winner = torch.ops.surfconv.surf_max_pool2d(x, scale, None, 0.0, kernel, [1, 1], [0, 0],
+                                                   [1, 1])  # fmt: skip
+    taps = kernel[0] * kernel[1]
+    assert winner.dtype == (torch.uint8 if taps <= 255 else torch.int32)
+    assert winner.eq(taps - 1).all()
+
+
+NN = [
+    {"kernel": k, "stride": s, "padding": p, "ceil_mode": c, "dilation": d}
+    for k, s, p, c, d in itertools.product(
+        [1, 2, 3, (2, 3), (4, 1), 5], [None, 1, 2, (3, 2)], [0, 1, 2], [False, True], [1, 2]
+    )
+    if p <= min(k if isinstance(k, tuple) else (k, k)) // 2
+]
+
+
+def at_scale_one(mode: str, case: dict[str, Any], **others: Any) -> Problem | None:
+    """None where nn has no such pool: the dilated kernel does not fit."""
+    kernel, ceil = case["kernel"], case.get("ceil_mode", False)
+    kernel = kernel if isinstance(kernel, tuple) else (kernel, kernel)
+    spans = [case.get("dilation", 1) * (k - 1) + 1 for k in kernel]
+    if any(span > size + 2 * case["padding"] for span, size in zip(spans, (7, 8), strict=True)):
+        assert not ceil or case["dilation"] > 1
+        return None
+    return make(mode, scale="ones", **(case | others))
+
+
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
+@pytest.mark.parametrize("dtype", DTYPES, ids=str)
+def test_maximum_at_scale_one_is_nn(layout: str, dtype: torch.dtype) -> None:
+    compared = 0
+    for case in NN:
+        problem = at_scale_one("max", case, channels=8, layout=layout, dtype=dtype)
+        if problem is None or problem.run_nn().isinf().any():
+            continue
+        compared += 1
+        problem.input.copy_((problem.input * 2).round())  # ties
+        x = problem.input.requires_grad_()
+        ours, theirs = problem.run(), problem.run_nn()
+        assert_same_bits(ours, theirs, str(case))
+        grad = torch.randn_like(ours)
+        values = [torch.autograd.grad(out, x, grad)[0] for out in (ours, theirs)]
+        # nn adds float16 gradients in float16; ours round once.
+        loose = dtype in (torch.bfloat16, torch.float16)
+        torch.testing.assert_close(*values, rtol=4e-2 if loose else 1e-6,
+                                   atol=4e-2 if loose else 1e-6)  # fmt: skip
+    assert compared > 100
+
+
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@both_counts
+@pytest.mark.parametrize("divisor", [None, 7])
+def test_average_at_scale_one_is_nn(
+    layout: str, dtype: torch.dtype, count_include_pad: bool, divisor: int | None
+) -> None:
+    compared = 0
+    for case in NN:
+        if case["dilation"] != 1:
+            continue
+        case = {k: v for k, v in case.items() if k != "dilation"}
+        others = {"count_include_pad": count_include_pad, "divisor_override": divisor}
+        problem = at_scale_one("avg", case | others, channels=8, layout=layout, dtype=dtype)
+        if problem is None:
+            continue
+        compared += 1
+        x = problem.input.requires_grad_()
+        ours, theirs = problem.run(), problem.run_nn()
+        tolerance = {"rtol": 4 * torch.finfo(dtype).eps, "atol": 4 * torch.finfo(dtype).eps}
+        torch.testing.assert_close(ours, theirs, **tolerance)
+        grad = torch.randn_like(ours)
+        torch.testing.assert_close(
+            torch.autograd.grad(ours, x, grad)[0], torch.autograd.grad(theirs, x, grad)[0],
+            **tolerance,
+        )  # fmt: skip
+    assert compared > 50
+
+
+def test_a_window_without_a_tap_is_zero() -> None:
+    """nn gives -inf where a dilated window steps over the whole image."""
+    x = torch.randn(1, 2, 1, 1, requires_grad=True)
+    scale = torch.ones(1, 1, 1, requires_grad=True)
+    out = surf_max_pool2d(x, 2, 1, 1, 2, scale=scale)
+    assert out.eq(0).all()
+    assert not any(g.any() for g in torch.autograd.grad(out.sum(), (x, scale)))
+    clamped = surf_max_pool2d(x, 2, 1, 1, 2, scale=scale * 1.5)
+    assert_same_bits(clamped, x)
+
+
+def test_maximum_of_dilated_taps_at_scale_one_only_leaves_out() -> None:
+    """Beside scale 1 the outer taps are clamped; at it they are not there."""
+    x = torch.tensor([[[[9.0, 0.0, 1.0, 2.0, 3.0]]]])
+    scale = torch.ones(1, 1, 3)
+    out = [surf_max_pool2d(x, (1, 3), (1, 1), (0, 1), (1, 2), scale=s)[0, 0, 0, 0]
+           for s in (scale, scale * 1.001)]  # fmt: skip
+    assert out[0] == 2.0 and out[1] == 9.0
+
+
+@each_mode
+def test_gradient_of_the_scale_on_pixels_is_one_sided(mode: str) -> None:
+    for scale in ("ones", "integers"):
+        problem = make(mode, 1, 1, dtype=torch.float64, scale=scale, axes=2, stride=1)
+        if mode == "max":
+            # At 0 and right beside 1 the winner changes with the scale.
+            problem.scale += 2
+        grad = torch.rand(problem.run().shape, dtype=torch.float64)
+        problem.check_gradients()
+        step = torch.full_like(problem.scale, 1e-7)
+        ahead = replace(problem, scale=problem.scale + step)
+        change = ((ahead.run() - problem.run()) * grad).sum(1) / 1e-7
+        both = problem.gradients(grad)["scale"].sum(1)
+        torch.testing.assert_close(change, both, rtol=1e-4, atol=1e-5)
+
+
+def test_the_first_of_equal_taps_wins() -> None:
+    x = torch.ones(1, 1, 4, 4, requires_grad=True)
+    out = surf_max_pool2d(x, 2, scale=torch.ones(1, 2, 2))
+    (grad,) = torch.autograd.grad(out.sum(), x)
+    assert grad[0, 0, ::2, ::2].eq(1).all() and grad.sum() == 4
+
+
+@pytest.mark.parametrize("channels", [1, 8])
+@pytest.mark.parametrize("scale", [1.0, 0.7])
+def test_nan_wins(channels: int, scale: float) -> None:
+    problem = make("max", 1, channels, (6, 6), stride=1, scale="ones")
+    problem.scale.fill_(scale)
+    problem.input[0, :, 2, 3] = float("nan")
+    out, expected = problem.run(), torch.from_numpy(problem.expected())
+    assert torch.equal(out.isnan(), expected.isnan()) and out.isnan().any()
+    if scale == 1.0:
+        x = problem.input.requires_grad_()
+        ours, theirs = (torch.autograd.grad(call().sum(), x)[0]
+                        for call in (problem.run, problem.run_nn))  # fmt: skip
+        assert_same_bits(ours, theirs)
+
+
+def test_all_minus_infinity_is_a_maximum() -> None:
+    problem = make("max", 1, 5, (6, 6), stride=1, scale="ones")
+    x = problem.input.fill_(-float("inf")).requires_grad_()
+    assert_same_bits(problem.run(), problem.run_nn())
+    ours, theirs = (torch.autograd.grad(call().sum(), x)[0]
+                    for call in (problem.run, problem.run_nn))  # fmt: skip
+    assert_same_bits(ours, theirs)
+
+
+def test_hidden_pixels_do_not_count_as_zero_in_a_maximum() -> None:
+    x = -torch.ones(1, 1, 5, 5)
+    guide = torch.ones(1, 5, 5)
+    guide[0, :, 3:] = 2.0
+    out = surf_max_pool2d(x, 3, 1, 1, scale=torch.full((1, 5, 5), 0.8), guide=guide)
+    torch.testing.assert_close(out, x)
+
+
+def test_the_oracle_agrees_with_nn() -> None:
+    """The judge itself: at scale 1 its loops are nn's pools."""
+    for case in [c for c in CASES if c not in [{"mode": "max"} | m for m in MAXIMA]]:
+        problem = make(**case, scale="ones", dtype=torch.float64)
+        np.testing.assert_allclose(problem.expected(), problem.run_nn().numpy(), atol=1e-12)
+        x = problem.input.requires_grad_()
+        grad = torch.randn_like(problem.run_nn())
+        (wanted,) = torch.autograd.grad(problem.run_nn(), x, grad)
+        actual = oracle_pools.backward(
+            problem.pool, grad.numpy(), x.detach().numpy(), problem.scale.numpy()
+        )
+        np.testing.assert_allclose(actual.input, wanted.numpy(), atol=1e-12)
+
+
+@each_mode
+def test_unbatched_and_shapes_of_scale(mode: str) -> None:
+    problem = make(mode, guide="levels")
+    out = problem.run()
+    assert_same_bits(replace(problem, scale=problem.scale[:, 0]).run(), out)
+    both = replace(problem, scale=problem.scale.expand(-1, 2, -1, -1)).run()
+    assert_same_bits(both, out)
+    assert problem.guide is not None
+    one = replace(problem, input=problem.input[0], scale=problem.scale[0], guide=problem.guide[0])
+    assert_same_bits(one.run(), out[0])
+    assert_same_bits(replace(one, scale=one.scale[0]).run(), out[0])
+
+
+@each_mode
+def test_empty_batch(mode: str) -> None:
+    problem = make(mode, guide="levels")
+    assert problem.guide is not None
+    empty = replace(problem, input=problem.input[:0], scale=problem.scale[:0],
+                    guide=problem.guide[:0])  # fmt: skip
+    out = empty.run()
+    assert out.shape == (0, *problem.run().shape[1:])
+    for name, value in empty.gradients(out).items():
+        assert value.shape == getattr(empty, name).shape
+
+
+@each_mode
+def test_arguments_are_those_of_the_functions_of_nn(mode: str) -> None:
+    x, scale = torch.randn(1, 2, 6, 6), torch.ones(1, 3, 3)
+    if mode == "max":
+        ours = surf_max_pool2d(x, 2, 2, 1, 3, True, scale=torch.ones(1, 4, 4)[:, :3, :3])
+        theirs = torch.nn.functional.max_pool2d(x, 2, 2, 1, 3, True)
+    else:
+        ours = surf_avg_pool2d(x, 2, None, 0, True, False, 3, scale=scale)
+        theirs = torch.nn.functional.avg_pool2d(x, 2, None, 0, True, False, 3)
+    torch.testing.assert_close(ours, theirs)
