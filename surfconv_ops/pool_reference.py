@@ -68,7 +68,10 @@ class _Sampler:
 
     def taps(self) -> Iterator[Tap]:
         """All taps in row order; visible are the corners that lie in the image."""
-        return taps(self._size, self._place.kernel, *_before_kernel(self._place), self._clamped)
+        place = self._place
+        for tap in taps(self._size, place.kernel, place.scale, None, 0.0, place.stride,
+                        place.padding, place.dilation, self._clamped):  # fmt: skip
+            yield tap._replace(corners=[_in_steps(corner) for corner in tap.corners])
 
     def seen(self, corner: Corner) -> Tensor:
         """Corners in the image that the guide shows, whatever their weight."""
@@ -90,8 +93,10 @@ class _Sampler:
         )
 
 
-def _before_kernel(place: Place) -> tuple[Tensor, None, float, Pair, Pair, Pair]:
-    return place.scale, None, 0.0, place.stride, place.padding, place.dilation
+def _in_steps(corner: Corner) -> Corner:
+    """Weights in steps of what 1 - weight can tell, so that a quotient of weights keeps its
+    precision where the guide leaves nothing but a corner that is all but at its end."""
+    return corner._replace(weight_y=1 - (1 - corner.weight_y), weight_x=1 - (1 - corner.weight_x))
 
 
 class _MaxSampler(_Sampler):
