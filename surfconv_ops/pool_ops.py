@@ -1,4 +1,4 @@
-"""The registered pools: schemas, kernels of last resort, and everything PyTorch must know of them.
+"""The registered pools and everything PyTorch must know of them.
 
 As for the convolution in ``ops.py``: the public functions go through the autograd Functions here,
 ``torch.ops.surfconv`` through the same rules by ``register_autograd``. A pool does not cast under
@@ -13,90 +13,18 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import pool_reference
-from ._fallback import warn_once
-from ._loader import missing_library_reason
+from . import pool_fallback, pool_reference
 from .geometry import Pair
-from .layout import lay_out, memory_format_of
+from .layout import memory_format_of
 from .ops import Library
-from .vmap import fold, unfold
-
-_TENSORS = "Tensor input, Tensor scale, Tensor? guide, "
-_MAX_OPTIONS = (
-    "float guide_tolerance, int[] kernel_size, int[] stride, int[] padding, int[] dilation"
-)
-_AVG_OPTIONS = (
-    "float guide_tolerance, int[] kernel_size, int[] stride, int[] padding,"
-    " bool count_include_pad, int divisor_override"
-)
-_NEEDS = ", bool need_input, bool need_scale) -> (Tensor, Tensor)"
-SCHEMAS = {
-    "surf_max_pool2d": f"surf_max_pool2d({_TENSORS}{_MAX_OPTIONS}) -> (Tensor, Tensor)",
-    "surf_max_pool2d_backward": (
-        f"surf_max_pool2d_backward(Tensor grad_output, {_TENSORS}Tensor winner,"
-        f" {_MAX_OPTIONS}{_NEEDS}"
-    ),
-    "surf_avg_pool2d": f"surf_avg_pool2d({_TENSORS}{_AVG_OPTIONS}) -> Tensor",
-    "surf_avg_pool2d_backward": (
-        f"surf_avg_pool2d_backward(Tensor grad_output, {_TENSORS}{_AVG_OPTIONS}{_NEEDS}"
-    ),
-}
+from .vmap import vmap_pool_backward, vmap_pool_forward
 
 Grads = tuple[Tensor | None, ...]
 
 
-def _max_forward(input: Tensor, *rest: Any) -> tuple[Tensor, Tensor]:
-    warn_once(input.device)
-    output, winner = pool_reference.max_forward(input, *rest)
-    return lay_out(output, memory_format_of(input)), winner
-
-
-def _avg_forward(input: Tensor, *rest: Any) -> Tensor:
-    warn_once(input.device)
-    return lay_out(pool_reference.avg_forward(input, *rest), memory_format_of(input))
-
-
-def _laid_out(
-    grads: tuple[Tensor, Tensor], input: Tensor, scale: Tensor, needs: Sequence[bool]
-) -> tuple[Tensor, Tensor]:
-    # An operator's results may not share memory: each that is not needed is a tensor of its own.
-    grad_input, grad_scale = (
-        lay_out(grad, memory_format_of(model)) if need else model.new_empty(0)
-        for grad, model, need in zip(grads, (input, scale), needs, strict=True)
-    )
-    return grad_input, grad_scale
-
-
-def _max_backward(
-    grad_output: Tensor, input: Tensor, scale: Tensor, *rest: Any
-) -> tuple[Tensor, Tensor]:
-    warn_once(input.device)
-    grads = pool_reference.max_backward(grad_output, input, scale, *rest)
-    return _laid_out(grads, input, scale, rest[-2:])
-
-
-def _avg_backward(
-    grad_output: Tensor, input: Tensor, scale: Tensor, *rest: Any
-) -> tuple[Tensor, Tensor]:
-    warn_once(input.device)
-    grads = pool_reference.avg_backward(grad_output, input, scale, *rest)
-    return _laid_out(grads, input, scale, rest[-2:])
-
-
-_KERNELS: dict[str, Callable[..., Any]] = {
-    "surf_max_pool2d": _max_forward,
-    "surf_max_pool2d_backward": _max_backward,
-    "surf_avg_pool2d": _avg_forward,
-    "surf_avg_pool2d_backward": _avg_backward,
-}
-
 # Kept for the life of the process: what it registered goes when it goes.
 _library = Library("surfconv", "FRAGMENT")
-for _name, _kernel in _KERNELS.items():
-    if missing_library_reason is not None:
-        _library.define(SCHEMAS[_name])
-    _library.impl(_name, _kernel, "CompositeExplicitAutograd")
-
+pool_fallback.register(_library)
 _max_op = torch.ops.surfconv.surf_max_pool2d.default
 _max_backward_op = torch.ops.surfconv.surf_max_pool2d_backward.default
 _avg_op = torch.ops.surfconv.surf_avg_pool2d.default
@@ -191,30 +119,6 @@ def _differentiate_backward(
     return tuple(result)
 
 
-def _map_forward(
-    call: Callable[..., Any], info: Any, in_dims: tuple[int | None, ...], args: tuple[Any, ...]
-) -> tuple[Any, Any]:
-    """A mapped dimension becomes part of N."""
-    size = info.batch_size
-    folded = [fold(args[i], in_dims[i], size) for i in range(3)]
-    result = call(*folded, *args[3:])
-    if isinstance(result, Tensor):
-        return unfold(result, size), 0
-    return tuple(unfold(part, size) for part in result), (0,) * len(result)
-
-
-def _map_backward(
-    call: Callable[..., Any], info: Any, in_dims: tuple[int | None, ...], args: tuple[Any, ...]
-) -> tuple[Any, Any]:
-    size = info.batch_size
-    tensors = 5 if isinstance(args[4], Tensor) else 4
-    folded = [fold(args[i], in_dims[i], size) for i in range(tensors)]
-    grads = call(*folded, *args[tensors:])
-    needs = args[-2:]
-    unfolded = [unfold(g, size) if need else g for g, need in zip(grads, needs, strict=True)]
-    return tuple(unfolded), tuple(0 if need else None for need in needs)
-
-
 # Arguments one by one: TorchDynamo 2.13 hands its context to a forward that takes ``*args``.
 class SurfMaxPool2dFunction(torch.autograd.Function):
     """The maximum and its winners; its backward is :class:`SurfMaxPool2dBackwardFunction`."""
@@ -252,7 +156,7 @@ class SurfMaxPool2dFunction(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
-        return _map_forward(SurfMaxPool2dFunction.apply, info, in_dims, args)
+        return vmap_pool_forward(SurfMaxPool2dFunction.apply, info.batch_size, in_dims, args)
 
 
 class SurfMaxPool2dBackwardFunction(torch.autograd.Function):
@@ -299,7 +203,9 @@ class SurfMaxPool2dBackwardFunction(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
-        return _map_backward(SurfMaxPool2dBackwardFunction.apply, info, in_dims, args)
+        return vmap_pool_backward(
+            SurfMaxPool2dBackwardFunction.apply, info.batch_size, in_dims, args
+        )
 
 
 class SurfAvgPool2dFunction(torch.autograd.Function):
@@ -340,7 +246,7 @@ class SurfAvgPool2dFunction(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
-        return _map_forward(SurfAvgPool2dFunction.apply, info, in_dims, args)
+        return vmap_pool_forward(SurfAvgPool2dFunction.apply, info.batch_size, in_dims, args)
 
 
 class SurfAvgPool2dBackwardFunction(torch.autograd.Function):
@@ -387,7 +293,9 @@ class SurfAvgPool2dBackwardFunction(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
-        return _map_backward(SurfAvgPool2dBackwardFunction.apply, info, in_dims, args)
+        return vmap_pool_backward(
+            SurfAvgPool2dBackwardFunction.apply, info.batch_size, in_dims, args
+        )
 
 
 def _register(
@@ -404,10 +312,10 @@ def _register(
         return _differentiate_backward(formula, ctx, *cotangents)
 
     def map_forward(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
-        return _map_forward(forward_op, info, in_dims, args)
+        return vmap_pool_forward(forward_op, info.batch_size, in_dims, args)
 
     def map_backward(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
-        return _map_backward(backward_op, info, in_dims, args)
+        return vmap_pool_backward(backward_op, info.batch_size, in_dims, args)
 
     forward, backward = f"surfconv::{name}", f"surfconv::{name}_backward"
     torch.library.register_fake(backward, _fake_backward, lib=_library)

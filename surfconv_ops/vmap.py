@@ -1,4 +1,4 @@
-"""vmap rules of the two operators.
+"""vmap rules of the operators.
 
 A mapped dimension becomes part of N where the filters are shared. Where they are not, or where
 each sample needs a filter gradient of its own, the samples are computed one by one.
@@ -23,9 +23,9 @@ def vmap_forward(
     input, weight, bias, scale, guide, *options = args
     _, weight_dim, bias_dim, *_ = in_dims
     if weight_dim is None and bias_dim is None:
-        folded = [fold(args[i], in_dims[i], size) for i in (0, 3, 4)]
+        folded = [_fold(args[i], in_dims[i], size) for i in (0, 3, 4)]
         output = call(folded[0], weight, bias, folded[1], folded[2], *options)
-        return unfold(output, size), 0
+        return _unfold(output, size), 0
     outputs = [call(*_pick(args, in_dims, i)) for i in range(size)]
     return torch.stack(outputs), 0
 
@@ -39,9 +39,9 @@ def vmap_backward(
     _, need_weight, need_bias, _ = needs
     out_dims = tuple(0 if need else None for need in needs)
     if in_dims[2] is None and not need_weight and not need_bias:
-        folded = [fold(args[i], in_dims[i], size) for i in (0, 1, 3, 4)]
+        folded = [_fold(args[i], in_dims[i], size) for i in (0, 1, 3, 4)]
         grads = call(folded[0], folded[1], weight, folded[2], folded[3], *rest)
-        unfolded = [unfold(g, size) if need else g for g, need in zip(grads, needs, strict=True)]
+        unfolded = [_unfold(g, size) if need else g for g, need in zip(grads, needs, strict=True)]
         return tuple(unfolded), out_dims
     samples = [call(*_pick(args, in_dims, i)) for i in range(size)]
     stacked = [
@@ -51,7 +51,30 @@ def vmap_backward(
     return tuple(stacked), out_dims
 
 
-def fold(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
+def vmap_pool_forward(
+    call: Callable[..., Any], size: int, in_dims: Dims, args: Sequence[Any]
+) -> tuple[Any, Any]:
+    """A pool's forward over a mapped dimension, which becomes part of N."""
+    folded = [_fold(args[i], in_dims[i], size) for i in range(3)]
+    result = call(*folded, *args[3:])
+    if isinstance(result, Tensor):
+        return _unfold(result, size), 0
+    return tuple(_unfold(part, size) for part in result), (0,) * len(result)
+
+
+def vmap_pool_backward(
+    call: Callable[..., Any], size: int, in_dims: Dims, args: Sequence[Any]
+) -> tuple[Any, Any]:
+    """A pool's backward over a mapped dimension; a maximum's has one tensor more, its winners."""
+    tensors = 5 if isinstance(args[4], Tensor) else 4
+    folded = [_fold(args[i], in_dims[i], size) for i in range(tensors)]
+    grads = call(*folded, *args[tensors:])
+    needs = args[-2:]
+    unfolded = [_unfold(g, size) if need else g for g, need in zip(grads, needs, strict=True)]
+    return tuple(unfolded), tuple(0 if need else None for need in needs)
+
+
+def _fold(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
     """(N, ...) with a mapped dimension somewhere or nowhere, as (size * N, ...)."""
     if tensor is None:
         return None
@@ -59,7 +82,7 @@ def fold(tensor: Tensor | None, dim: int | None, size: int) -> Tensor | None:
     return spread.flatten(0, 1)
 
 
-def unfold(tensor: Tensor, size: int) -> Tensor:
+def _unfold(tensor: Tensor, size: int) -> Tensor:
     return tensor.reshape(size, tensor.shape[0] // size, *tensor.shape[1:])
 
 

@@ -65,7 +65,7 @@ def ends(pool: Pool, axis: int, output: int, index: int, scale: float, size: int
     offset = centre - base + (scale * tap if tap != 0 else 0.0)
     limited = max(min(offset, FAR), -FAR)
     low = math.floor(limited) if tap >= 0 else math.ceil(limited) - 1
-    fraction = limited - low
+    fraction = 1.0 - (1.0 - (limited - low))  # all but on a pixel is on it
     low += base
     pair = [Ends(low, 1.0 - fraction, -tap), Ends(low + 1, fraction, tap)]
     if pool.average:

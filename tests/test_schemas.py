@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from surfconv_ops import _fallback
+from surfconv_ops import _fallback, pool_fallback
 
 SOURCE = Path(__file__).parent.parent / "csrc" / "library.cpp"
 SCHEMAS = {
     "surf_conv2d": _fallback.FORWARD_SCHEMA,
     "surf_conv2d_backward": _fallback.BACKWARD_SCHEMA,
     "level_values": _fallback.LEVEL_VALUES_SCHEMA,
-}
+} | pool_fallback.SCHEMAS
 
 
 def normal(schema: str) -> str:

@@ -18,7 +18,8 @@
 namespace surfconv::cpu {
 
 extern const Kernels kernels_avx2;
-const Kernels kernels_avx2 = {"avx2", avx2_isa::forward, avx2_isa::backward, &avx2_isa::pool_kernels};
+const Kernels kernels_avx2 = {"avx2", avx2_isa::forward, avx2_isa::backward,
+                              &avx2_isa::pool_kernels};
 
 }  // namespace surfconv::cpu
 

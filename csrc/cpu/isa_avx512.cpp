@@ -18,7 +18,8 @@
 namespace surfconv::cpu {
 
 extern const Kernels kernels_avx512;
-const Kernels kernels_avx512 = {"avx512", avx512_isa::forward, avx512_isa::backward, &avx512_isa::pool_kernels};
+const Kernels kernels_avx512 = {"avx512", avx512_isa::forward, avx512_isa::backward,
+                                &avx512_isa::pool_kernels};
 
 }  // namespace surfconv::cpu
 

@@ -11,6 +11,7 @@
 namespace surfconv::cpu {
 
 extern const Kernels kernels_default;
-const Kernels kernels_default = {"default", default_isa::forward, default_isa::backward, &default_isa::pool_kernels};
+const Kernels kernels_default = {"default", default_isa::forward, default_isa::backward,
+                                 &default_isa::pool_kernels};
 
 }  // namespace surfconv::cpu

@@ -71,7 +71,9 @@ void fill_pool_axis(const Axis& axis, const T* __restrict scale, const int64_t* 
     for (int m = 0; m < kTile; ++m) {
       const bool near = at.reachable[m] != 0;
       const int64_t lo = at.lo[m];
-      T fraction = at.fraction[m];
+      // In steps of what 1 - fraction can tell: a quotient of weights keeps its precision where
+      // the guide leaves nothing but a corner that is all but at its end.
+      T fraction = 1 - (1 - at.fraction[m]);
       bool in_lo, in_hi;
       if constexpr (E == Edges::zero) {
         in_lo = near & (lo >= 0) & (lo <= last);
