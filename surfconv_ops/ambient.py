@@ -44,12 +44,10 @@ class DepthCall:
         self.layers_run: set[nn.Module] = set()
         self._resized: list[_Resized] = []
         self._backward_pass = -1
-        self._functorch_level: int | None = None
 
     def begin(self) -> DepthCall | None:
         """Make this the call that is running; returns the one before, which is to be put back."""
         self._backward_pass = _backward_pass()
-        self._functorch_level = _functorch_level()
         before, _thread.call = _thread.call, self
         return before
 
@@ -106,18 +104,11 @@ class DepthCall:
         depth = self.depth.to(dtype)
         if not (_same(depth.shape[-2], height) and _same(depth.shape[-1], width)):
             depth = resize_depth(depth, height, width)
-        if self._may_keep(tracing):
+        # A graph for training may be a checkpoint's part, which nothing may leave; there the
+        # compiler itself removes what is computed twice.
+        if not tracing or torch.compiler.is_exporting() or not torch.is_grad_enabled():
             self._resized.append(_Resized(height, width, dtype, mode, depth))
         return depth
-
-    def _may_keep(self, tracing: bool) -> bool:
-        """Whether what is made here can be used elsewhere in the call."""
-        if tracing:
-            # In a graph for training this may be a checkpoint's part, which nothing may leave;
-            # the compiler itself removes what is computed twice there.
-            return torch.compiler.is_exporting() or not torch.is_grad_enabled()
-        # What is made inside a transform of the net's own ends with it.
-        return _functorch_level() == self._functorch_level
 
     def _name(self, layer: nn.Module) -> str:
         for name, module in self.module.named_modules():
@@ -211,11 +202,6 @@ def _backward_pass() -> int:
     """Which backward pass this thread is working on; -1 for none."""
     number: int = torch._C._current_graph_task_id()
     return number
-
-
-def _functorch_level() -> int | None:
-    level: int | None = torch._C._functorch.maybe_current_level()
-    return level
 
 
 def _same(size: int, other: int) -> bool:

@@ -370,7 +370,7 @@ def test_functional_call_and_gradients_per_sample() -> None:
 
 
 def test_transform_inside_the_net() -> None:
-    """What a transform of the net's own makes is not handed to layers outside it."""
+    """A map that is made within a transform of the net's own serves layers outside it too."""
 
     class Inside(nn.Module):
         def __init__(self) -> None:

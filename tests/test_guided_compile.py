@@ -151,7 +151,8 @@ def test_graph_breaks(how: str, nested: bool) -> None:
         compiled = DepthGuided(torch.compile(net.module, backend="aot_eager"))
     if how == "in place":
         compiled = DepthGuided(Broken())
-        compiled.module.load_state_dict(net.module.state_dict())
+        compiled.module.first, compiled.module.second = net.module.first, net.module.second
+        compiled.module.at_break = net.module.at_break
         compiled.module.compile(backend="aot_eager")
     with warnings.catch_warnings(), torch._dynamo.config.patch(nested_graph_breaks=nested):
         warnings.filterwarnings("error", "DepthGuided")

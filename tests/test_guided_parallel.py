@@ -96,10 +96,15 @@ class Checkpointed(nn.Module):
 
     def __init__(self, reentrant: bool, contexts: bool = False) -> None:
         super().__init__()
-        self.first = SurfConv2d(3, 4, 3, stride=2, padding=1, reference_depth=2.0)
+        self.first = nn.Sequential(
+            SurfConv2d(3, 4, 3, stride=2, padding=1, reference_depth=2.0),
+            SurfConv2d(4, 4, 3, padding=1, reference_depth=2.0), nn.Sigmoid(),
+        )  # fmt: skip
+        # One resolution that came up before, and one that did not.
         self.part = nn.Sequential(
             SurfConv2d(4, 4, 3, padding=1, reference_depth=2.0), nn.Sigmoid(),
             SurfConv2d(4, 2, 3, stride=2, padding=1, reference_depth=2.0), nn.Sigmoid(),
+            SurfConv2d(2, 2, 3, padding=1, reference_depth=2.0), nn.Sigmoid(),
         )  # fmt: skip
         self.options = {"use_reentrant": reentrant}
         if contexts:
@@ -217,7 +222,7 @@ def test_checkpoint_inside_with_its_contexts(needs: str) -> None:
         return grads if depth.grad is None else [*grads, depth.grad]
 
     expected = run(on=False, late=False)
-    assert len(expected) == (7 if needs == "depth too" else 6)
+    assert len(expected) == (11 if needs == "depth too" else 10)
     for late in (False, True):
         for ours, wanted in zip(run(on=True, late=late), expected, strict=True):
             assert_same_bits(ours, wanted)
