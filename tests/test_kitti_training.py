@@ -183,6 +183,9 @@ def test_a_killed_run_goes_on_to_the_same_result(
     train_script.main(arguments(frames, "cut"))
     assert without_seconds(cut) == without_seconds(whole)
     one, other = (read_checkpoint(run / "last.pt") for run in (cut, whole))
+    final = read_checkpoint(cut / "final.pt")
+    assert final["epoch"] == 3 and "optimizer" not in final
+    assert all(torch.equal(value, one["model"][name]) for name, value in final["model"].items())
     for name, value in one["model"].items():
         assert torch.equal(value, other["model"][name]), name
     assert one["best"] == other["best"]

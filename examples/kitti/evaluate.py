@@ -31,7 +31,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     add = parser.add_argument
-    add("--checkpoint", type=Path, required=True, help="best.pt or last.pt of a run")
+    add("--checkpoint", type=Path, required=True, help="final.pt, best.pt or last.pt of a run")
     add("--data", type=Path, required=True, help="folder with rgb/, depth/, hha/ and label/")
     add("--out", type=Path, help="folder for metrics.json and pictures.png (the checkpoint's)")
     add("--names", type=Path, help="file of the names of frames to evaluate (all frames)")

@@ -4,7 +4,8 @@
 
 Writes into the folder --out: config.json, levels.json, metrics.jsonl (a line an epoch), last.pt
 (to go on from; a killed run that is started again with the same command ends with the same
-result), best.pt and best.json (the epoch of the best validation IOU_surf), last.json.
+result), best.pt and best.json (the epoch of the best validation IOU_surf), last.json, and at the
+end final.pt (the last epoch, without what training needs).
 """
 
 from __future__ import annotations
@@ -168,6 +169,8 @@ class Training:
                     line["val"] = self._validate()
                     bar.set_postfix(iou_surf=f"{line['val']['iou_surf']:.4f}")
                 self._finish_epoch(line)
+        known = json.loads((self.out / "last.json").read_text(encoding="utf-8"))
+        save_checkpoint(self.out / "final.pt", self.model, settings, self.levels, **known)
 
     def _train_epoch(self, epoch: int, bar: tqdm[Any]) -> dict[str, Any]:
         started, total = time.perf_counter(), 0.0
