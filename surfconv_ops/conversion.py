@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import warnings
 import weakref
 from collections.abc import Callable
@@ -15,6 +14,7 @@ from .convertible import CONVERTED_FROM, LEFT_OUT, obstacle
 from .depth_layer import DepthLayer, DepthOptions
 from .levels import DepthLevels
 from .modules import SurfConv2d
+from .pools import SurfAvgPool2d, SurfMaxPool2d
 
 Include = Callable[[str, nn.Module], bool]
 
@@ -119,10 +119,10 @@ def _check_options(options: dict[str, Any]) -> None:
 def _surf_layer(layer: nn.Module, options: dict[str, Any]) -> nn.Module:
     if isinstance(layer, nn.Conv2d):
         return SurfConv2d.from_conv2d(layer, **options)
-    pools: Any = importlib.import_module(".pools", __package__)
-    swap = pools.SurfMaxPool2d if isinstance(layer, nn.MaxPool2d) else pools.SurfAvgPool2d
-    new: nn.Module = swap.from_pool(layer, **options)
-    return new
+    if isinstance(layer, nn.MaxPool2d):
+        return SurfMaxPool2d.from_pool(layer, **options)
+    assert isinstance(layer, nn.AvgPool2d)
+    return SurfAvgPool2d.from_pool(layer, **options)
 
 
 def _move_state(old: nn.Module, new: nn.Module) -> None:

@@ -88,11 +88,10 @@ def conversion_report(module: nn.Module) -> ConversionReport:
         >>> from torch import nn
         >>> from surfconv_ops import conversion_report, convert_conv2d
         >>> net = nn.Sequential(nn.Conv2d(3, 8, 3), nn.Conv2d(8, 2, 1))
-        >>> print(conversion_report(convert_conv2d(net, reference_depth=2.0)))
-        layer  was                     now                              why
-        0      Conv2d(3, 8, 3 x 3)     SurfConv2d(reference_depth=2.0)
-        1      Conv2d(8, 2, 1 x 1)     unchanged                        its 1 x 1 window ...
-        1 layers take depth, 1 are unchanged
+        >>> for row in conversion_report(convert_conv2d(net, reference_depth=2.0)).rows:
+        ...     print(row.name, row.now, row.why or "-")
+        0 SurfConv2d(reference_depth=2.0) -
+        1 unchanged its 1 x 1 window reaches no neighbour
     """
     if not isinstance(module, nn.Module):
         raise TypeError(f"module: expected an nn.Module, got {type_name(module)}")

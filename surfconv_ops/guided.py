@@ -144,6 +144,7 @@ class DepthGuided(nn.Module):
 
         Example:
             >>> from torch.utils.checkpoint import checkpoint
+            >>> from surfconv_ops import DepthGuided, SurfConv2d
             >>> block = SurfConv2d(3, 8, 3, reference_depth=2.0)
             >>> contexts = DepthGuided.checkpoint_contexts
             >>> def net(x):
