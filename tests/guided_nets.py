@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
+from surfconv_ops import DepthGuided, convert_conv2d
 from surfconv_ops.depth_layer import DepthLayer
 
 
@@ -66,6 +69,10 @@ NETS = {
     "residual": lambda: nn.Sequential(Residual(3, 6, 2), Residual(6, 4, 1)),
     "encoder-decoder": EncoderDecoder,
 }
+
+
+def guided(name: str = "encoder-decoder", **options: Any) -> DepthGuided:
+    return DepthGuided(convert_conv2d(NETS[name](), **({"reference_depth": 2.0} | options)))
 
 
 def frames(batch: int = 2, height: int = 20, width: int = 26) -> tuple[Tensor, Tensor]:
