@@ -259,6 +259,22 @@ def test_hidden_pixels_do_not_count_as_zero_in_a_maximum() -> None:
     torch.testing.assert_close(out, x)
 
 
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
+def test_a_guide_that_would_hide_every_tap_does_not_apply_to_a_maximum(layout: str) -> None:
+    problem = make("max", kernel=2, stride=1, padding=0, guide="depth", layout=layout, channels=4,
+                   dtype=torch.float64)  # fmt: skip
+    # Taps of a kernel of 2 then lie further from the centre than its own pixel.
+    problem.scale += 3.1
+    out = problem.run()
+    problem.check_forward()
+    problem.check_gradients()
+    # Clamped into the first row and column, a tap meets the first window's own pixel.
+    blind = replace(problem, guide=None).run()
+    assert_same_bits(out[..., 1:, :], blind[..., 1:, :])
+    average = replace(problem, mode="avg")
+    assert average.run().eq(0).all()
+
+
 def test_the_oracle_agrees_with_nn() -> None:
     """The judge itself: at scale 1 its loops are nn's pools."""
     for case in [c for c in CASES if c not in [{"mode": "max"} | m for m in MAXIMA]]:
