@@ -14,6 +14,7 @@ from torch import Tensor
 
 import evaluate as evaluate_script
 import train as train_script
+from evaluation import FIGURES
 from kitti_frames import SIZE, write_folder
 from losses import LOSSES, segmentation_loss
 from paper_net import PARAMETERS_AT_CAPACITY_1, PaperNet, parameter_count
@@ -62,7 +63,7 @@ def test_every_mode_has_the_same_parameters_and_at_reference_depth_the_same_scor
     mode: str,
 ) -> None:
     torch.manual_seed(3)
-    settings = Settings(mode, reference_depth=15.0, pools=True)
+    settings = Settings(mode, reference_depth=15.0, pools=mode in ("levels", "continuous"))
     model = Segmenter(settings, LEVELS).double().eval()
     torch.manual_seed(3)
     plain = PaperNet().double().eval()
@@ -221,6 +222,38 @@ def test_the_folder_says_how_many_classes_there_are(frames: Path) -> None:
         evaluate_script.main(
             ["--checkpoint", str(runs / "twelve" / "best.pt"), "--data", str(frames)]
         )
+
+
+@pytest.mark.parametrize(
+    ("mode", "more", "message"),
+    [
+        ("conv2d", ["--min-scale", "1"], "min_scale: mode conv2d has no use for it"),
+        ("pyramid", ["--pools"], "pools: mode pyramid has no use for it"),
+        ("levels", ["--depth-window", "2"], "depth_window: mode levels has no use for it"),
+        ("continuous", ["--same-level-only"], "same_level_only: mode continuous has no use"),
+        ("continuous", ["--epochs", "0"], "epochs: expected at least 1, got 0"),
+        ("continuous", ["--batch", "0"], "batch: expected at least 1, got 0"),
+    ],
+)
+def test_settings_that_would_do_nothing_are_refused(
+    frames: Path, mode: str, more: list[str], message: str
+) -> None:
+    with pytest.raises(SystemExit, match=message):
+        train_script.main(arguments(frames, "run", "--mode", mode, *more))
+    assert not (frames.parent / "run").exists()
+
+
+def test_the_best_epoch_is_found_after_one_without_a_figure(
+    frames: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    figures = iter([math.nan, 0.2, 0.1])
+
+    def validate(_: Any) -> dict[str, float]:
+        return dict.fromkeys(FIGURES, next(figures))
+
+    monkeypatch.setattr(train_script.Training, "_validate", validate)
+    train_script.main(arguments(frames, "run"))
+    assert read_checkpoint(frames.parent / "run" / "best.pt")["epoch"] == 2
 
 
 def test_settings_and_arguments_have_the_same_names(frames: Path) -> None:

@@ -17,6 +17,18 @@ MODES = ("conv2d", "pyramid", "levels", "continuous")
 FORMAT = "surfconv_ops kitti checkpoint 1"
 
 
+#: Settings that not every mode has a use for, and the modes that have.
+_FUSED = ("levels", "continuous")
+_USED_BY = {
+    "min_scale": _FUSED,
+    "max_scale": _FUSED,
+    "pools": _FUSED,
+    "depth_window": ("continuous",),
+    "same_level_only": ("pyramid", "levels"),
+    "invalid_scale": ("pyramid", *_FUSED),
+}
+
+
 class CheckpointError(ValueError):
     """A file is not a checkpoint of this example."""
 
@@ -45,6 +57,18 @@ class Settings:
     validation: str = "kitti"
     classes: int = CLASSES
 
+    def check(self) -> None:
+        """Raise ValueError where a setting is out of range or would do nothing in this mode."""
+        if self.mode not in MODES:
+            raise ValueError(f"mode: expected one of {MODES}, got {self.mode!r}")
+        for name in ("levels", "capacity", "epochs", "batch"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        for field in dataclasses.fields(self):
+            modes = _USED_BY.get(field.name, MODES)
+            if self.mode not in modes and getattr(self, field.name) != field.default:
+                raise ValueError(f"{field.name}: mode {self.mode} has no use for it, only {modes}")
+
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers and strings."""
         return dataclasses.asdict(self)
@@ -60,8 +84,7 @@ class Segmenter(nn.Module):
 
     def __init__(self, settings: Settings, levels: DepthLevels) -> None:
         super().__init__()
-        if settings.mode not in MODES:
-            raise ValueError(f"mode: expected one of {MODES}, got {settings.mode!r}")
+        settings.check()
         self.classes = settings.classes
         self.net = PaperNet(settings.capacity, classes=settings.classes)
         # In a list, so that the parameters are registered once and a checkpoint's keys are the

@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import sys
 import time
 from collections.abc import Iterator
@@ -44,6 +45,7 @@ class Training:
     """A run: its data, its net, how far it is, and its folder."""
 
     def __init__(self, settings: Settings, data: Path, out: Path, device: torch.device) -> None:
+        settings.check()
         self.out, self.device = out, device
         self.folder = FrameFolder(data)
         settings = dataclasses.replace(settings, classes=len(self.folder.class_names))
@@ -105,8 +107,8 @@ class Training:
         config = {
             **self.settings.as_dict(),
             "parameters": parameter_count(self.model),
-            "train_frames": len(self.names),
-            "val_frames": len(self.validation_names),
+            "frames": len(self.names),
+            "validation_frames": len(self.validation_names),
             "device": str(self.device),
             "threads": torch.get_num_threads(),
             "torch": torch.__version__,
@@ -204,8 +206,11 @@ class Training:
         validated = line.get("val")
         self.schedule.after_epoch(self.epoch, None if validated is None else validated["iou_surf"])
         known = {"epoch": self.epoch, "val": validated}
-        better = validated is None or (
-            self.best is None or validated["iou_surf"] > self.best["val"]["iou_surf"]
+        better = (
+            validated is None
+            or self.best is None
+            or math.isnan(self.best["val"]["iou_surf"])
+            or validated["iou_surf"] > self.best["val"]["iou_surf"]
         )
         with (self.out / "metrics.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps(without_nan(line)) + "\n")
