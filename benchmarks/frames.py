@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from surfconv_ops import DepthLevels
+from surfconv_ops import DepthLevels, fit_depth_levels
 
 VARIABLE = "SURFCONV_DATA"
 RANDOM = "random"
@@ -44,16 +44,6 @@ class Scene:
     @property
     def window(self) -> float:
         return WINDOW_SHARE * self.reference_depth
-
-
-def equal_count_levels(depth: Tensor, count: int) -> DepthLevels:
-    """Levels of equally many valid pixels; fewer where too few depths differ."""
-    valid = depth[depth > 0].double().sort().values
-    cuts = [float(part[-1]) for part in torch.tensor_split(valid, count)[:-1] if len(part)]
-    edges = sorted({cut for cut in cuts if cut < float(valid[-1])})
-    bounds = torch.bucketize(valid, torch.tensor(edges, dtype=torch.float64))
-    centers = [float(valid[bounds == level].mean()) for level in range(len(edges) + 1)]
-    return DepthLevels(edges, centers)
 
 
 def _read(path: Path) -> np.ndarray:
@@ -144,4 +134,4 @@ def make_scene(kind: str, batch: int, height: int, width: int, levels: int = 4) 
         images = [_fit(frames[i % len(frames)], height, width) for i in range(batch)]
         depth = torch.stack(images)
         reference = float(depth[depth > 0].median())
-    return Scene(kind, depth, reference, equal_count_levels(depth, levels))
+    return Scene(kind, depth, reference, fit_depth_levels(depth, levels, gamma=0.0))

@@ -31,6 +31,7 @@ from report import Report, read_rows, write_data
 from rows import Row
 from suites import SUITES
 from suites.job import Job
+from surfconv_ops.cli.common import count
 from timing import thread_count
 
 #: Largest thread counts that are measured unless others are asked for.
@@ -65,16 +66,6 @@ def _bar(total: int) -> Iterator[Bar]:
         yield bar
 
 
-def _count(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a whole number, got {text!r}") from None
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected 1 or more, got {value}")
-    return value
-
-
 def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     """Read the command line."""
     parser = argparse.ArgumentParser(
@@ -85,7 +76,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--out", type=Path, default=Path("out/benchmark"), metavar="DIR",
         help="folder for everything that is written (default: %(default)s)")  # fmt: skip
     cores = os.cpu_count() or 1
-    add("--threads", type=_count, nargs="+", metavar="N",
+    add("--threads", type=count, nargs="+", metavar="N",
         default=list(range(1, min(cores, DEFAULT_THREADS) + 1)),
         help="thread counts; single runs use the first (default: %(default)s)")  # fmt: skip
     add("--suites", nargs="+", choices=list(SUITES), default=list(SUITES), metavar="NAME",

@@ -10,7 +10,6 @@ millimetre, 1e-4 where it is a tenth of one, 90/65535 where 65535 stands for 90 
 from __future__ import annotations
 
 import argparse
-import math
 import sys
 from pathlib import Path
 
@@ -18,36 +17,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from frame_input import SATURATED, FrameError, equal_count_levels, load_frame
-from frame_net import CLASSES, DrawnLayer, FrameNet, Measured, measure
+from frame_input import SATURATED, FrameError, load_frame
+from frame_net import CLASSES, DrawnLayer, FrameNet, Measured, measure, with_depth
 from frame_picture import Explained, save_picture
 from frame_points import NAMES, Footprint, choose_points, snap
-from surfconv_ops import DepthLevels, depth_to_scale
+from surfconv_ops import depth_to_scale, fit_depth_levels
+from surfconv_ops.cli.common import count, positive
 from synthetic_scene import Frame, crate_centers, make_frame
 
 SMALLEST_SIDE = 64
-
-
-def _positive(text: str) -> float:
-    """A positive number or a fraction such as 90/65535."""
-    try:
-        top, _, bottom = text.partition("/")
-        value = float(top) / float(bottom) if bottom else float(top)
-    except (ValueError, ZeroDivisionError):
-        raise argparse.ArgumentTypeError(f"expected a number or a fraction, got {text!r}") from None
-    if not (math.isfinite(value) and value > 0):
-        raise argparse.ArgumentTypeError(f"expected a positive finite number, got {text!r}")
-    return value
-
-
-def _count(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a whole number, got {text!r}") from None
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"expected 1 or more, got {value}")
-    return value
 
 
 def _pixel(text: str) -> tuple[int, int]:
@@ -65,8 +43,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add = parser.add_argument
     add("--rgb", type=Path, metavar="FILE", help="colour image; default: the synthetic scene")
     add("--depth", type=Path, metavar="FILE", help="16-bit depth image of the same size; 0 = hole")
-    add("--depth-scale", type=_positive, metavar="S", help="metres per count of --depth")
-    add("--focal", type=_positive, metavar="F", help="focal length in pixels")
+    add("--depth-scale", type=positive, metavar="S", help="metres per count of --depth")
+    add("--focal", type=positive, metavar="F", help="focal length in pixels")
     add(
         "--invalid-counts",
         type=int,
@@ -78,11 +56,11 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     add(
         "--reference-depth",
-        type=_positive,
+        type=positive,
         metavar="M",
         help="depth in metres at which SurfConv2d is nn.Conv2d (default: the frame's median)",
     )
-    add("--levels", type=_count, default=4, metavar="N", help="depth levels (default: 4)")
+    add("--levels", type=count, default=4, metavar="N", help="depth levels (default: 4)")
     add(
         "--pixels",
         type=_pixel,
@@ -90,8 +68,8 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
         metavar="ROW,COLUMN",
         help="a near, a middle and a far pixel to explain (default: chosen on flat surfaces)",
     )
-    add("--rounds", type=_count, default=9, metavar="N", help="timed steps per net (default: 9)")
-    add("--threads", type=_count, metavar="N", help="threads (default: torch's own choice)")
+    add("--rounds", type=count, default=9, metavar="N", help="timed steps per net (default: 9)")
+    add("--threads", type=count, metavar="N", help="threads (default: torch's own choice)")
     add(
         "--out",
         type=Path,
@@ -184,8 +162,7 @@ def run(chosen: argparse.Namespace) -> None:
     frame = _load(chosen)
     valid = frame.depth > 0
     reference_depth = chosen.reference_depth or float(np.median(frame.depth[valid]))
-    edges, centers = equal_count_levels(frame.depth, chosen.levels)
-    levels = DepthLevels(edges, centers)
+    levels = fit_depth_levels(frame.depth, chosen.levels, gamma=0.0)
 
     depth = torch.from_numpy(frame.depth)[None]
     image = torch.from_numpy(frame.rgb).permute(2, 0, 1)[None].float().div(255).contiguous()
@@ -207,8 +184,8 @@ def run(chosen: argparse.Namespace) -> None:
         f"Scale: {scale[valid].min():.2f} to {scale[valid].max():.2f} "
         f"(98 % of pixels: {low:.2f} to {high:.2f}), 1 in holes"
     )
-    bounds = [shown_depth.min(), *edges, shown_depth.max()]
-    for number, center in enumerate(centers):
+    bounds = [shown_depth.min(), *levels.edges, shown_depth.max()]
+    for number, center in enumerate(levels.centers):
         share = 100 * (level == number).sum() / valid.sum()
         print(
             f"Level {number}: {bounds[number]:.2f} to {bounds[number + 1]:.2f} m, all taken as "
@@ -217,13 +194,10 @@ def run(chosen: argparse.Namespace) -> None:
 
     torch.manual_seed(0)
     nets = {
-        "nn.Conv2d": FrameNet(),
-        "SurfConv2d continuous": FrameNet(reference_depth),
-        f"SurfConv2d {len(centers)} levels": FrameNet(reference_depth, levels),
+        "nn.Conv2d": (plain := FrameNet()),
+        "SurfConv2d continuous": with_depth(plain, reference_depth),
+        f"SurfConv2d {len(levels)} levels": with_depth(plain, reference_depth, levels),
     }
-    state = nets["nn.Conv2d"].state_dict()
-    for net in nets.values():
-        net.load_state_dict(state)
     results = measure(nets, image, depth, chosen.rounds)
     shape = results["nn.Conv2d"].output_shape
     print(f"Net: {tuple(image.shape)} to {shape}, {CLASSES} classes, the same weights in all three")
@@ -236,8 +210,8 @@ def run(chosen: argparse.Namespace) -> None:
             reference_depth=reference_depth,
             scale=np.where(valid, scale, np.nan),
             level=np.where(valid, level, np.nan).astype(np.float32),
-            edges=edges,
-            centers=centers,
+            edges=list(levels.edges),
+            centers=list(levels.centers),
             names=NAMES,
             conv2d=_footprints(frame, points, np.ones_like(scale)),
             continuous=_footprints(frame, points, scale),

@@ -76,18 +76,3 @@ def load_frame(
         )
     depth = np.where(valid, counts * depth_scale, 0.0).astype(np.float32)
     return Frame(rgb, depth, focal)
-
-
-def equal_count_levels(
-    depth: NDArray[np.float32], num_levels: int
-) -> tuple[list[float], list[float]]:
-    """Edges and centres (metres) of depth levels that hold equally many valid pixels each.
-
-    Levels that would be empty, because many pixels share one depth, are merged.
-    """
-    valid = np.sort(depth[depth > 0].astype(np.float64))
-    cuts = np.unique(np.quantile(valid, np.arange(1, num_levels) / num_levels, method="lower"))
-    edges = [float(edge) for edge in cuts if edge < valid[-1]]
-    bounds = np.searchsorted(valid, edges, side="right")
-    centers = [float(part.mean()) for part in np.split(valid, bounds)]
-    return edges, centers

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 import statistics
 import time
@@ -12,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from surfconv_ops import DepthLevels, SurfConv2d, at_output_centers
+from surfconv_ops import DepthGuided, DepthLevels, convert_conv2d
 
 # (in, out, stride, dilation) of 3x3 layers, padded so that tap 0 is the centre of every pixel kept.
 LAYERS = ((3, 16, 2, 1), (16, 32, 2, 1), (32, 64, 2, 1), (64, 64, 1, 2))
@@ -38,45 +39,27 @@ class DrawnLayer:
         return KERNEL * self.tap_spacing
 
 
-class FrameNet(nn.Module):
-    """Four 3x3 layers, SurfConv2d if a reference depth is given, and a 1x1 classifier."""
+class FrameNet(nn.Sequential):
+    """Four 3x3 layers and a 1x1 classifier: scores (N, 8, H/8, W/8) of an image (N, 3, H, W)."""
 
-    def __init__(
-        self, reference_depth: float | None = None, levels: DepthLevels | None = None
-    ) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.layers = nn.ModuleList()
         for channels_in, channels_out, stride, dilation in LAYERS:
-            if reference_depth is None:
-                layer = nn.Conv2d(
+            self.append(
+                nn.Conv2d(
                     channels_in, channels_out, KERNEL, stride, padding=dilation, dilation=dilation
                 )
-            else:
-                layer = SurfConv2d(
-                    channels_in,
-                    channels_out,
-                    KERNEL,
-                    stride,
-                    padding=dilation,
-                    dilation=dilation,
-                    reference_depth=reference_depth,
-                    levels=levels,
-                )
-            self.layers.append(layer)
-        self.classifier = nn.Conv2d(LAYERS[-1][1], CLASSES, 1)
+            )
+            self.append(nn.ReLU())
+        self.append(nn.Conv2d(LAYERS[-1][1], CLASSES, 1))
 
-    def forward(self, image: Tensor, depth: Tensor) -> Tensor:
-        """Scores (N, 8, H/8, W/8) of an image (N, 3, H, W) with depth (N, H, W) in metres."""
-        features = image
-        for layer in self.layers:
-            if isinstance(layer, SurfConv2d):
-                features = torch.relu(layer(features, depth))
-                depth = at_output_centers(
-                    depth, layer.kernel_size, layer.stride, layer.padding, layer.dilation
-                )
-            else:
-                features = torch.relu(layer(features))
-        return self.classifier(features)
+
+def with_depth(
+    net: FrameNet, reference_depth: float, levels: DepthLevels | None = None
+) -> DepthGuided:
+    """A copy of the net whose 3x3 layers are SurfConv2d."""
+    copied = copy.deepcopy(net)
+    return DepthGuided(convert_conv2d(copied, reference_depth=reference_depth, levels=levels))
 
 
 @dataclass
@@ -119,7 +102,7 @@ def _step(net: nn.Module, image: Tensor, depth: Tensor, result: Measured) -> Non
     net.zero_grad(set_to_none=True)
     leaf = image.clone().requires_grad_()
     start = time.perf_counter()
-    output = net(leaf, depth)
+    output = net(leaf, depth=depth) if isinstance(net, DepthGuided) else net(leaf)
     middle = time.perf_counter()
     output.square().mean().backward()
     end = time.perf_counter()

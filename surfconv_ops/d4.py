@@ -12,6 +12,7 @@ from torch import Tensor
 
 from .checks import check_finite, check_integer, type_name
 from .depth_table import DepthTable, add_tables, distinct_depths, into_bins, valid_values
+from .gathering import gather_parts
 from .levels import DepthLevels
 from .levels_fit import fit_table
 
@@ -166,17 +167,7 @@ class D4:
             Traceback (most recent call last):
             RuntimeError: all_reduce: torch.distributed is not initialised; call ...
         """
-        distributed = torch.distributed
-        if not (distributed.is_available() and distributed.is_initialized()):
-            raise RuntimeError(
-                "all_reduce: torch.distributed is not initialised; call"
-                " torch.distributed.init_process_group in every process first, or add up objects"
-                " of one process with merge"
-            )
-        if distributed.get_rank(group) < 0:
-            raise ValueError("group: this process is not a member of it")
-        parts: list[Any] = [None] * distributed.get_world_size(group)
-        distributed.all_gather_object(parts, self, group)
+        parts = gather_parts(self, group)
         whole = parts[0]
         for part in parts[1:]:
             whole.merge(part)

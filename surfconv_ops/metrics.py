@@ -20,6 +20,7 @@ from .checks import (
     valid_depth,
 )
 from .figures import figures, figures_by_class
+from .gathering import gather_parts
 
 #: Boundaries of the depth ranges that figures are also given for, in metres.
 DEPTH_RANGES = (0.0, 5.0, 10.0, 20.0, 40.0, math.inf)
@@ -245,18 +246,7 @@ class SegmentationMetrics:
                 different arguments.
             RuntimeError: torch.distributed is not initialised.
         """
-        distributed = torch.distributed
-        if not (distributed.is_available() and distributed.is_initialized()):
-            raise RuntimeError(
-                "all_reduce: torch.distributed is not initialised; call"
-                " torch.distributed.init_process_group in every process first, or add up objects"
-                " of one process with merge"
-            )
-        if distributed.get_rank(group) < 0:
-            raise ValueError("group: this process is not a member of it")
-        parts: list[Any] = [None] * distributed.get_world_size(group)
-        # Gathered, not reduced, so that all processes add in one order and get the same bits.
-        distributed.all_gather_object(parts, self, group)
+        parts = gather_parts(self, group)
         whole = parts[0]
         for part in parts[1:]:
             whole.merge(part)

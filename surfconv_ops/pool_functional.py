@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from .avg_pool_ops import SurfAvgPool2dFunction
 from .checks import PairArgument
-from .pool_ops import SurfAvgPool2dFunction, SurfMaxPool2dFunction
+from .max_pool_ops import SurfMaxPool2dFunction
 from .pool_validation import check_divisor, check_pool, check_pool_input, check_pool_window
 
 
@@ -75,7 +76,7 @@ def surf_max_pool2d(
     batched = check_pool_input(input, scale, guide)
     size = (input.shape[-2], input.shape[-1])
     window = check_pool_window(size, kernel_size, stride, padding, dilation, ceil_mode)
-    arguments = check_pool(input, scale, guide, guide_tolerance, window, batched)
+    arguments = check_pool(input, scale, guide, guide_tolerance, window)
     output: Tensor = SurfMaxPool2dFunction.apply(
         *arguments, window.kernel, window.stride, window.padding_before, window.dilation
     )[0]
@@ -142,7 +143,7 @@ def surf_avg_pool2d(
     size = (input.shape[-2], input.shape[-1])
     window = check_pool_window(size, kernel_size, stride, padding, 1, ceil_mode)
     divisor = check_divisor(divisor_override)
-    arguments = check_pool(input, scale, guide, guide_tolerance, window, batched)
+    arguments = check_pool(input, scale, guide, guide_tolerance, window)
     output: Tensor = SurfAvgPool2dFunction.apply(
         *arguments,
         window.kernel,

@@ -9,7 +9,7 @@ from torch import Tensor
 from . import geometry
 from .checks import PairArgument, check_not_negative, check_pair, type_name
 from .geometry import Pair
-from .validation import Window, check_guide, check_scale, check_tensors
+from .validation import Window, as_batch, check_guide, check_scale, check_tensors
 
 
 class PoolArguments(NamedTuple):
@@ -84,19 +84,14 @@ def check_pool_window(
 
 
 def check_pool(
-    input: Any, scale: Any, guide: Any, guide_tolerance: Any, window: PoolWindow, batched: bool
+    input: Any, scale: Any, guide: Any, guide_tolerance: Any, window: PoolWindow
 ) -> PoolArguments:
     """The pools' tensors, with a batch."""
     check_scale(scale, input, window)
     if guide is not None:
         check_guide(guide, input)
     tolerance = check_not_negative(guide_tolerance, "guide_tolerance")
-    if not batched:
-        input, scale = input.unsqueeze(0), scale.unsqueeze(0)
-        guide = None if guide is None else guide.unsqueeze(0)
-    if scale.ndim == 3:
-        scale = scale.unsqueeze(1)
-    return PoolArguments(input, scale, guide, tolerance)
+    return PoolArguments(*as_batch(input, scale, guide), tolerance)
 
 
 def check_pool_input(input: Any, scale: Any, guide: Any) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 
 from torch import Tensor, nn
 
@@ -13,8 +13,56 @@ from .levels import DepthLevels
 from .pool_functional import surf_avg_pool2d, surf_max_pool2d
 from .pool_validation import check_divisor, check_pool_window
 
+_Pool = TypeVar("_Pool", bound="SurfPool2d")
 
-class SurfMaxPool2d(DepthLayer, nn.MaxPool2d):
+
+class SurfPool2d(DepthLayer):
+    """What both pools share: how one takes the place of nn's."""
+
+    #: nn's pool, and its arguments in their order.
+    _plain: ClassVar[type[nn.Module]]
+    _arguments: ClassVar[tuple[str, ...]]
+
+    @classmethod
+    def from_pool(
+        cls: type[_Pool], pool: nn.Module, *, reference_depth: FloatPairArgument, **options: Any
+    ) -> _Pool:
+        """A pool with depth that takes the place of ``pool``.
+
+        Args:
+            pool: nn's pool of the same kind, or one that was made from it.
+            reference_depth: Depth in metres at which the layer is ``pool``, or a (y, x) pair.
+            **options: The other depth arguments, from ``levels`` on.
+
+        Returns:
+            The layer, in the training mode of ``pool``.
+
+        Raises:
+            TypeError: ``pool`` is of another kind, or a subclass whose forward may do more.
+            ValueError: A number is out of its range.
+            NotImplementedError: ``pool`` returns indices.
+
+        Example:
+            >>> from torch import nn
+            >>> from surfconv_ops import SurfMaxPool2d
+            >>> SurfMaxPool2d.from_pool(nn.MaxPool2d(2), reference_depth=2.0).stride
+            2
+        """
+        name = cls._plain.__name__
+        if not isinstance(pool, cls._plain):
+            raise TypeError(f"pool: expected nn.{name}, got {type_name(pool)}")
+        if type(pool) is not cls._plain and not isinstance(pool, SurfPool2d):
+            raise TypeError(
+                f"pool: expected nn.{name} itself, got the subclass {type_name(pool)}, whose"
+                " forward may do more than pool"
+            )
+        shape = {argument: getattr(pool, argument) for argument in cls._arguments}
+        make: Any = cls
+        layer: _Pool = make(**shape, reference_depth=reference_depth, **options)
+        return layer.train(pool.training)
+
+
+class SurfMaxPool2d(SurfPool2d, nn.MaxPool2d):
     """:class:`torch.nn.MaxPool2d` whose window covers the same metres of surface at every depth.
 
     At a pixel of depth z the taps lie ``reference_depth / z`` times as far apart as in
@@ -60,6 +108,9 @@ class SurfMaxPool2d(DepthLayer, nn.MaxPool2d):
         torch.Size([1, 8, 6, 8])
     """
 
+    _plain = nn.MaxPool2d
+    _arguments = ("kernel_size", "stride", "padding", "dilation", "return_indices", "ceil_mode")
+
     def __init__(
         self,
         kernel_size: PairArgument,
@@ -102,42 +153,6 @@ class SurfMaxPool2d(DepthLayer, nn.MaxPool2d):
         )
         self._set_depth_options(options)
 
-    @classmethod
-    def from_pool(
-        cls, pool: nn.MaxPool2d, *, reference_depth: FloatPairArgument, **options: Any
-    ) -> SurfMaxPool2d:
-        """A SurfMaxPool2d that takes the place of ``pool``.
-
-        Args:
-            pool: A plain nn.MaxPool2d or a SurfMaxPool2d.
-            reference_depth: Depth in metres at which the layer is ``pool``, or a (y, x) pair.
-            **options: :class:`SurfMaxPool2d`'s other depth arguments, from ``levels`` on.
-
-        Returns:
-            The layer, in the training mode of ``pool``.
-
-        Raises:
-            TypeError: ``pool`` is no nn.MaxPool2d, or a subclass whose forward may do more.
-            ValueError: A number is out of its range.
-            NotImplementedError: ``pool`` returns indices.
-
-        Example:
-            >>> SurfMaxPool2d.from_pool(nn.MaxPool2d(2), reference_depth=2.0).stride
-            2
-        """
-        _check_replaceable(pool, nn.MaxPool2d, SurfMaxPool2d)
-        layer = cls(
-            pool.kernel_size,
-            pool.stride,
-            pool.padding,
-            pool.dilation,
-            pool.return_indices,
-            pool.ceil_mode,
-            reference_depth=reference_depth,
-            **options,
-        )
-        return layer.train(pool.training)
-
     def forward(self, input: Tensor, depth: Tensor | None = None) -> Tensor:
         """The maximum under every window.
 
@@ -167,7 +182,7 @@ class SurfMaxPool2d(DepthLayer, nn.MaxPool2d):
         )
 
 
-class SurfAvgPool2d(DepthLayer, nn.AvgPool2d):
+class SurfAvgPool2d(SurfPool2d, nn.AvgPool2d):
     """:class:`torch.nn.AvgPool2d` whose window covers the same metres of surface at every depth.
 
     At a pixel of depth z the taps lie ``reference_depth / z`` times as far apart as in
@@ -213,6 +228,12 @@ class SurfAvgPool2d(DepthLayer, nn.AvgPool2d):
         torch.Size([1, 8, 6, 8])
     """
 
+    _plain = nn.AvgPool2d
+    _arguments = (
+        *("kernel_size", "stride", "padding", "ceil_mode", "count_include_pad"),
+        "divisor_override",
+    )
+
     def __init__(
         self,
         kernel_size: PairArgument,
@@ -249,41 +270,6 @@ class SurfAvgPool2d(DepthLayer, nn.AvgPool2d):
             check_divisor(divisor_override),
         )
         self._set_depth_options(options)
-
-    @classmethod
-    def from_pool(
-        cls, pool: nn.AvgPool2d, *, reference_depth: FloatPairArgument, **options: Any
-    ) -> SurfAvgPool2d:
-        """A SurfAvgPool2d that takes the place of ``pool``.
-
-        Args:
-            pool: A plain nn.AvgPool2d or a SurfAvgPool2d.
-            reference_depth: Depth in metres at which the layer is ``pool``, or a (y, x) pair.
-            **options: :class:`SurfAvgPool2d`'s other depth arguments, from ``levels`` on.
-
-        Returns:
-            The layer, in the training mode of ``pool``.
-
-        Raises:
-            TypeError: ``pool`` is no nn.AvgPool2d, or a subclass whose forward may do more.
-            ValueError: A number is out of its range.
-
-        Example:
-            >>> SurfAvgPool2d.from_pool(nn.AvgPool2d(2), reference_depth=2.0).stride
-            2
-        """
-        _check_replaceable(pool, nn.AvgPool2d, SurfAvgPool2d)
-        layer = cls(
-            pool.kernel_size,
-            pool.stride,
-            pool.padding,
-            pool.ceil_mode,
-            pool.count_include_pad,
-            pool.divisor_override,
-            reference_depth=reference_depth,
-            **options,
-        )
-        return layer.train(pool.training)
 
     def forward(self, input: Tensor, depth: Tensor | None = None) -> Tensor:
         """The average under every window.
@@ -323,13 +309,3 @@ def _check_window_arguments(kernel_size: Any, stride: Any, padding: Any, dilatio
         check_pair(stride, "stride", 1)
     check_pair(padding, "padding", 0)
     check_pair(dilation, "dilation", 1)
-
-
-def _check_replaceable(pool: Any, kind: type[nn.Module], surf: type[nn.Module]) -> None:
-    if not isinstance(pool, kind):
-        raise TypeError(f"pool: expected nn.{kind.__name__}, got {type_name(pool)}")
-    if type(pool) is not kind and not isinstance(pool, surf):
-        raise TypeError(
-            f"pool: expected nn.{kind.__name__} itself, got the subclass {type_name(pool)}, whose"
-            " forward may do more than pool"
-        )

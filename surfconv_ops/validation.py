@@ -150,11 +150,7 @@ def check_surf_conv2d(
     if guide is not None:
         check_guide(guide, input)
     tolerance = check_not_negative(guide_tolerance, "guide_tolerance")
-    if not batched:
-        input, scale = input.unsqueeze(0), scale.unsqueeze(0)
-        guide = None if guide is None else guide.unsqueeze(0)
-    if scale.ndim == 3:
-        scale = scale.unsqueeze(1)
+    input, scale, guide = as_batch(input, scale, guide)
     arguments = SurfConv2dArguments(
         input,
         weight,
@@ -168,6 +164,16 @@ def check_surf_conv2d(
         groups,
     )
     return arguments, batched
+
+
+def as_batch(
+    input: Tensor, scale: Tensor, guide: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """(N, C, H, W), (N, 1 | 2, Ho, Wo) and (N, H, W), of checked tensors that may lack N or 1."""
+    if input.ndim == 3:
+        input, scale = input.unsqueeze(0), scale.unsqueeze(0)
+        guide = None if guide is None else guide.unsqueeze(0)
+    return input, scale if scale.ndim == 4 else scale.unsqueeze(1), guide
 
 
 def check_tensors(input: Any, others: dict[str, Any], optional: tuple[str, ...] = ()) -> None:
