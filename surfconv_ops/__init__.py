@@ -1,5 +1,7 @@
 """SurfConv: 2D convolution whose footprint follows the depth of the surface it looks at."""
 
+from types import ModuleType
+
 from . import reference
 from .conversion import convert_conv2d
 from .convertible import conversion_report
@@ -36,3 +38,12 @@ __all__ = [
     "surf_conv2d",
     "surf_max_pool2d",
 ]
+
+
+def __getattr__(name: str) -> ModuleType:
+    # Imported on use alone: Triton takes longer to import than the whole package.
+    if name == "triton":
+        from importlib import import_module
+
+        return import_module(".triton", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -28,12 +28,16 @@ LEVEL_VALUES_SCHEMA = "level_values(Tensor depth, Tensor edges, Tensor values) -
 _warned = False
 
 
-def warn_once(device: torch.device) -> None:
+def warn_once(device: torch.device, missing: str = "") -> None:
+    """Say once that the reference runs; ``missing`` is why a CUDA tensor has no kernels."""
     global _warned
     if _warned:
         return
     _warned = True
-    if missing_library_reason is None:
+    if missing:
+        reason = f"the kernels for {device.type} tensors cannot be used ({missing})"
+        remedy = "install Triton: `pip install triton`"
+    elif missing_library_reason is None:
         reason = f"there is no compiled kernel for {device.type} tensors"
         remedy = "move the module and its inputs to the CPU"
     else:
@@ -50,7 +54,7 @@ def warn_once(device: torch.device) -> None:
     )
 
 
-def _forward(
+def forward(
     input: Tensor,
     weight: Tensor,
     bias: Tensor | None,
@@ -69,7 +73,7 @@ def _forward(
     return lay_out(output, memory_format_of(input))
 
 
-def _backward(
+def backward(
     grad_output: Tensor,
     input: Tensor,
     weight: Tensor,
@@ -131,6 +135,6 @@ def register(library: torch.library.Library) -> None:
         library.define(FORWARD_SCHEMA)
         library.define(BACKWARD_SCHEMA)
         library.define(LEVEL_VALUES_SCHEMA)
-    library.impl("surf_conv2d", _forward, "CompositeExplicitAutograd")
-    library.impl("surf_conv2d_backward", _backward, "CompositeExplicitAutograd")
+    library.impl("surf_conv2d", forward, "CompositeExplicitAutograd")
+    library.impl("surf_conv2d_backward", backward, "CompositeExplicitAutograd")
     library.impl("level_values", level_values, "CompositeExplicitAutograd")

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import _fallback, depth_ops, direct, reference
+from . import _fallback, cuda_ops, depth_ops, direct, reference
 from .autocast import autocast_disabled, cast_to_autocast_dtype
 from .geometry import Pair
 from .layout import memory_format_of
@@ -54,6 +54,7 @@ class Library(torch.library.Library):
 # Kept for the life of the process: what it registered goes when it goes.
 _library = Library("surfconv", "FRAGMENT")
 _fallback.register(_library)
+cuda_ops.register(_library)
 depth_ops.register(_library)
 _forward_op = torch.ops.surfconv.surf_conv2d.default
 _backward_op = torch.ops.surfconv.surf_conv2d_backward.default
@@ -101,13 +102,13 @@ def _vmap_level_values(
     return torch.ops.surfconv.level_values(depth, edges, values), in_dims[0]
 
 
-def _save_forward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+def save_forward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     input, weight, _, scale, guide, *options = inputs
     ctx.save_for_backward(input, weight, scale, guide)
     ctx.options = options
 
 
-def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+def save_backward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     grad_output, input, weight, scale, guide, *options = inputs
     ctx.save_for_backward(grad_output, input, weight, scale, guide)
     ctx.options, ctx.needs = options[:5], options[5:]
@@ -115,9 +116,7 @@ def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     ctx.set_materialize_grads(False)
 
 
-def _differentiate_forward(
-    call: Callable[..., tuple[Tensor, ...]], ctx: Any, grad: Tensor
-) -> Grads:
+def differentiate_forward(call: Callable[..., tuple[Tensor, ...]], ctx: Any, grad: Tensor) -> Grads:
     """Gradients of the forward's ten arguments, computed by ``call``, the backward."""
     input, weight, scale, guide = ctx.saved_tensors
     needed = ctx.needs_input_grad
@@ -127,7 +126,7 @@ def _differentiate_forward(
     return (*used, None, None, None, None, None, None)
 
 
-def _differentiate_backward(ctx: Any, *cotangents: Tensor | None) -> Grads:
+def differentiate_backward(ctx: Any, *cotangents: Tensor | None) -> Grads:
     """Gradients of the backward's fourteen arguments: the derivative of the reference's formula."""
     saved = ctx.saved_tensors
     wanted = [i for i in range(4) if ctx.needs_input_grad[i]]
@@ -194,11 +193,11 @@ class SurfConv2dFunction(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _save_forward(ctx, inputs, output)
+        save_forward(ctx, inputs, output)
 
     @staticmethod
     def backward(ctx: Any, grad_output: Tensor) -> Grads:
-        return _differentiate_forward(_call_backward, ctx, grad_output)
+        return differentiate_forward(_call_backward, ctx, grad_output)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Tensor, int]:
@@ -246,11 +245,11 @@ class SurfConv2dBackwardFunction(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _save_backward(ctx, inputs, output)
+        save_backward(ctx, inputs, output)
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor | None) -> Grads:
-        return _differentiate_backward(ctx, *cotangents)
+        return differentiate_backward(ctx, *cotangents)
 
     @staticmethod
     def vmap(
@@ -260,14 +259,12 @@ class SurfConv2dBackwardFunction(torch.autograd.Function):
 
 
 def _register_derivatives() -> None:
-    def differentiate_forward(ctx: Any, grad: Tensor) -> Grads:
-        return _differentiate_forward(_backward_op, ctx, grad)
+    def of_forward(ctx: Any, grad: Tensor) -> Grads:
+        return differentiate_forward(_backward_op, ctx, grad)
 
+    torch.library.register_autograd(_FORWARD, of_forward, setup_context=save_forward, lib=_library)
     torch.library.register_autograd(
-        _FORWARD, differentiate_forward, setup_context=_save_forward, lib=_library
-    )
-    torch.library.register_autograd(
-        _BACKWARD, _differentiate_backward, setup_context=_save_backward, lib=_library
+        _BACKWARD, differentiate_backward, setup_context=save_backward, lib=_library
     )
 
 

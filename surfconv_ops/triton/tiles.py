@@ -1,0 +1,127 @@
+"""How a kernel's work is cut into tiles, and which of a few ways is the fastest here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from statistics import median
+from typing import Any
+
+import torch
+import triton
+
+from .conv import LEAST_PRODUCT, Conv
+
+#: Kernels of up to this many taps are written out tap by tap.
+MOST_UNROLLED_TAPS = 9
+_ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class Tiles:
+    """Lanes of a tile along pixels, input channels and output channels; warps; loads in flight.
+
+    ``unrolled``: the forward's taps are written out, so that those on pixels cost fewer loads.
+    """
+
+    pixels: int
+    channels_in: int
+    channels_out: int
+    warps: int
+    stages: int
+    unrolled: bool = False
+
+    def constants(self) -> dict[str, Any]:
+        """As the kernels and their launch take them."""
+        return {
+            "BLOCK_PIXELS": self.pixels,
+            "BLOCK_IN": self.channels_in,
+            "BLOCK_OUT": self.channels_out,
+            "num_warps": self.warps,
+            "num_stages": self.stages,
+        }
+
+
+def _block(channels: int, most: int) -> int:
+    return max(LEAST_PRODUCT, min(most, triton.next_power_of_2(channels)))
+
+
+def forward_tiles(conv: Conv) -> list[Tiles]:
+    """Ways to cut the forward, the one to take without a choice first."""
+    if conv.lanes:
+        return [Tiles(32, 1, _block(conv.out_channels, 64), 4, 2)]
+    inner, outer = _block(conv.group_channels, 64), _block(conv.group_out, 128)
+    first = Tiles(64, min(inner, 32), min(outer, 64), 4, 3)
+    others = [replace(first, pixels=128, channels_out=outer, warps=8)]
+    others += [replace(others[0], channels_in=inner)]
+    if conv.taps <= MOST_UNROLLED_TAPS:
+        others.append(replace(first, unrolled=True))
+    return list(dict.fromkeys([first, *others]))
+
+
+def data_tiles(conv: Conv) -> list[Tiles]:
+    """Ways to cut the gradients of input and scale."""
+    if conv.lanes:
+        return [Tiles(32, _block(conv.channels, 64), 1, 4, 2)]
+    inner, outer = _block(conv.group_channels, 64), _block(conv.group_out, 64)
+    first = Tiles(64, min(inner, 32), outer, 8, 3)
+    return list(dict.fromkeys([first, replace(first, channels_in=inner, stages=2)]))
+
+
+def weight_tiles(conv: Conv) -> list[Tiles]:
+    """Ways to cut the gradient of the weight."""
+    if conv.lanes:
+        return [Tiles(32, 1, _block(conv.out_channels, 64), 4, 2)]
+    inner, outer = _block(conv.group_channels, 64), _block(conv.group_out, 64)
+    first = Tiles(64, inner, outer, 8, 2)
+    return list(dict.fromkeys([first, Tiles(32, inner, outer, 4, 3)]))
+
+
+_chosen: dict[Hashable, Tiles] = {}
+
+
+def fastest(
+    name: str,
+    conv: Conv,
+    variant: Hashable,
+    candidates: Sequence[Tiles],
+    run: Callable[[Tiles], object],
+    device: torch.device,
+) -> Tiles:
+    """The candidate that ``run`` takes least time with, found once per kernel and layer.
+
+    ``run`` may be called any number of times. The first candidate is taken untried off the GPU,
+    while a graph is captured, which must not wait for the device, and where torch asks for
+    deterministic algorithms, because sums of other tiles round differently.
+    """
+    if (
+        len(candidates) == 1
+        or device.type != "cuda"
+        or torch.are_deterministic_algorithms_enabled()
+    ):
+        return candidates[0]
+    # Batches of nearby sizes share a choice: a net that sees many sizes is not tuned for each.
+    size = conv.pixels.bit_length()
+    layer = replace(conv, batch=0, size=(0, 0), output=(0, 0), padding=(0, 0))
+    key = (name, device.index, layer, size, variant)
+    if key not in _chosen:
+        if torch.cuda.is_current_stream_capturing():
+            return candidates[0]
+        _chosen[key] = min(candidates, key=lambda tiles: _seconds(run, tiles))
+    return _chosen[key]
+
+
+def _seconds(run: Callable[[Tiles], object], tiles: Tiles) -> float:
+    try:
+        run(tiles)
+    except triton.runtime.errors.OutOfResources:
+        return float("inf")
+    times = []
+    for _ in range(_ROUNDS):
+        start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        start.record()
+        run(tiles)
+        end.record()
+        end.synchronize()
+        times.append(start.elapsed_time(end))
+    return median(times)
