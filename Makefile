@@ -6,6 +6,7 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 PYTEST_ARGS ?= -n 2
 BENCH_ARGS ?=
+GPU_TESTS ?= tests/test_gpu*.py tests/test_triton*.py tests/test_cuda_ops.py
 
 VENV := .venv
 PY := $(VENV)/bin/python
@@ -21,7 +22,7 @@ endif
 
 # Two pip runs must never write to one environment; what is slow below is parallel in itself.
 .NOTPARALLEL:
-.PHONY: build demo test lint format asan bench wheel clean distclean help
+.PHONY: build demo test test-gpu lint format asan bench wheel clean distclean help
 
 build: $(VENV)/.installed  ## create .venv where it is missing, install, compile what changed
 	@$(PY) setup.py -q build_ext --inplace
@@ -31,6 +32,11 @@ demo: build $(VENV)/.examples  ## run SurfConv on a built-in scene and save a pi
 
 test: build $(VENV)/.dev  ## run the tests
 	$(PY) -m pytest $(PYTEST_ARGS)
+
+# The same kernels that `make test` runs in Triton's interpreter, compiled, and what needs a device.
+test-gpu: build $(VENV)/.dev  ## run the tests that need a CUDA device
+	@$(PY) -c 'import torch; torch.cuda.init()'
+	$(PY) -m pytest $(GPU_TESTS)
 
 lint: $(VENV)/.dev  ## check style and types
 	$(VENV)/bin/ruff check .
@@ -73,7 +79,7 @@ distclean: clean
 	rm -rf $(VENV)
 
 help:
-	@sed -n 's/^\([a-z]*\):.*## /\1	/p' $(MAKEFILE_LIST)
+	@sed -n 's/^\([a-z-]*\):.*## /\1	/p' $(MAKEFILE_LIST)
 
 # Systems that package Python apart from ensurepip still make an environment; the pip outside
 # then fills it.

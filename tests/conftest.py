@@ -10,6 +10,11 @@ import pytest
 import torch
 from hypothesis import HealthCheck, settings
 
+# Without a GPU the CUDA backend's kernels run in Triton's interpreter, which has to be chosen
+# before they are imported.
+if not torch.cuda.is_available():
+    os.environ.setdefault("TRITON_INTERPRET", "1")
+
 settings.register_profile(
     "suite",
     deadline=None,
@@ -24,6 +29,7 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "suite"))
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "core: the subset that runs under sanitizers")
+    config.addinivalue_line("markers", "gpu: what needs a CUDA device (make test-gpu)")
     # Two workers with two threads each on two cores spend their time waiting for one another.
     if "PYTEST_XDIST_WORKER" in os.environ:
         torch.set_num_threads(1)

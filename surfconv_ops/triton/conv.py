@@ -101,14 +101,12 @@ class Conv:
 
     @property
     def wide(self) -> bool:
-        reach = (
-            max(n, s * max(o, 1) + p + d * k)
-            for n, s, o, p, d, k in zip(
-                self.size, self.stride, self.output, self.padding, self.dilation, self.kernel,
-                strict=True,
-            )
+        """Whether positions need 64-bit integers."""
+        axes = zip(
+            self.size, self.stride, self.output, self.padding, self.dilation, self.kernel,
+            strict=True,
         )  # fmt: skip
-        return max(reach) >= NARROW_REACH
+        return any(max(n, s * max(o, 1) + p + d * k) >= NARROW_REACH for n, s, o, p, d, k in axes)
 
     def places(self) -> tuple[int, ...]:
         """The kernels' arguments from ``count`` to ``width``."""
@@ -143,8 +141,12 @@ class Conv:
 
 
 def tensor_float32() -> bool:
-    """torch's own setting for products of float32."""
-    return bool(torch.backends.cuda.matmul.allow_tf32)
+    """torch's own setting for products of float32 matrices."""
+    matmul = torch.backends.cuda.matmul
+    # Where torch has the newer setting, reading the older one raises once the newer was used.
+    if hasattr(matmul, "fp32_precision"):
+        return str(matmul.fp32_precision) == "tf32"
+    return bool(matmul.allow_tf32)
 
 
 def channels_innermost(tensor: Tensor) -> Tensor:

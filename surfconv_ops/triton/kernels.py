@@ -44,7 +44,8 @@ def forward(
     """``torch.ops.surfconv.surf_conv2d`` on CUDA tensors, or on the CPU in the interpreter."""
     if needs_float32(input):
         options = (guide, guide_tolerance, stride, padding, dilation, groups)
-        return in_float32(forward, (input, weight, bias, scale, *options)).to(input.dtype)
+        wide: Tensor = in_float32(forward, (input, weight, bias, scale, *options))
+        return wide.to(input.dtype)
     conv = Conv.of(input, weight, scale, stride, padding, dilation, groups)
     shape = (conv.batch, *conv.output, conv.out_channels)
     output = torch.empty(shape, dtype=conv.dtype, device=input.device)
@@ -140,7 +141,8 @@ def _backward_data(
 
     def parts(tiles: Tiles) -> int:
         width, groups = (conv.channels, 1) if conv.lanes else (conv.group_channels, conv.groups)
-        return triton.cdiv(width, tiles.channels_in) * groups
+        blocks: int = triton.cdiv(width, tiles.channels_in)
+        return blocks * groups
 
     def run(tiles: Tiles) -> Tensor:
         if sums is not None:

@@ -121,7 +121,7 @@ def share(fraction, SIDE: tl.constexpr):
 
 @triton.jit
 def corner(image, pixels, samples, SIDE_Y: tl.constexpr, SIDE_X: tl.constexpr):
-    """Which samples see a corner, whatever its weight, and how many pixels behind theirs it lies."""
+    """Which samples see a corner, whatever its weight, and its distance from theirs in memory."""
     y = samples.y + SIDE_Y
     x = samples.x + SIDE_X
     seen = samples.reached & (y >= 0) & (y < image.height) & (x >= 0) & (x < image.width)

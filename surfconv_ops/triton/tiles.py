@@ -43,7 +43,8 @@ class Tiles:
 
 
 def _block(channels: int, most: int) -> int:
-    return max(LEAST_PRODUCT, min(most, triton.next_power_of_2(channels)))
+    power: int = triton.next_power_of_2(channels)
+    return max(LEAST_PRODUCT, min(most, power))
 
 
 def forward_tiles(conv: Conv) -> list[Tiles]:
@@ -116,7 +117,7 @@ def _seconds(run: Callable[[Tiles], object], tiles: Tiles) -> float:
         run(tiles)
     except triton.runtime.errors.OutOfResources:
         return float("inf")
-    times = []
+    times: list[float] = []
     for _ in range(_ROUNDS):
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         start.record()

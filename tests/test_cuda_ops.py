@@ -1,0 +1,148 @@
+"""How CUDA tensors reach their kernels, as far as it can be seen without a GPU."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+import surfconv_ops
+from helpers import Problem, assert_same_bits, make_problem
+from surfconv_ops import _fallback, cuda_ops, depth_to_scale, reference, surf_conv2d
+from surfconv_ops.validation import check_surf_conv2d
+
+OPERATORS = ("surf_conv2d", "surf_conv2d_backward")
+HERE = Path(__file__).parent
+
+
+def arguments_of(problem: Problem) -> tuple[Any, ...]:
+    tensors = (problem.input, problem.weight, problem.bias)
+    return tuple(check_surf_conv2d(*tensors, **problem.options)[0])
+
+
+def run_python(code: str, **variables: str) -> str:
+    environment = os.environ | {"PYTHONPATH": str(Path(surfconv_ops.__file__).parents[1])}
+    environment |= variables
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("name", OPERATORS)
+def test_are_registered_for_cuda(name: str) -> None:
+    assert torch._C._dispatch_has_kernel_for_dispatch_key(f"surfconv::{name}", "CUDA")
+
+
+def test_triton_is_not_imported_before_a_cuda_tensor_comes() -> None:
+    run_python(
+        "import sys, torch, surfconv_ops\n"
+        "x, w = torch.randn(1, 2, 5, 5), torch.randn(3, 2, 3, 3, requires_grad=True)\n"
+        "surfconv_ops.surf_conv2d(x, w, scale=torch.ones(1, 3, 3)).sum().backward()\n"
+        "assert 'triton' not in sys.modules and 'surfconv_ops.triton' not in sys.modules\n"
+    )
+
+
+def test_the_backend_is_an_attribute_of_the_package() -> None:
+    pytest.importorskip("triton")
+    run_python("import surfconv_ops; surfconv_ops.triton.surf_conv2d")
+    with pytest.raises(AttributeError, match="no_such_name"):
+        surfconv_ops.no_such_name  # noqa: B018
+
+
+def test_without_triton_the_package_works_and_says_what_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "triton.py").write_text("raise ImportError('no Triton here')\n")
+    package = str(Path(surfconv_ops.__file__).parents[1])
+    run_python(
+        "import surfconv_ops\n"
+        "from surfconv_ops import cuda_ops\n"
+        "kernels, reason = cuda_ops.backend()\n"
+        "assert kernels is None and 'no Triton here' in reason, reason\n"
+        "try: surfconv_ops.triton\n"
+        "except ImportError as error: assert 'needs the package triton' in str(error)\n"
+        "else: raise AssertionError\n",
+        PYTHONPATH=os.pathsep.join((str(tmp_path), package)),
+    )
+
+
+def test_the_registered_functions_run_the_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On CPU tensors here: what the dispatcher would call for CUDA tensors."""
+    pytest.importorskip("triton")
+    monkeypatch.setattr(_fallback, "forward", None)
+    monkeypatch.setattr(_fallback, "backward", None)
+    problem = make_problem(1, 2, 3, (4, 5))
+    arguments = arguments_of(problem)
+    output = cuda_ops._forward(*arguments)
+    torch.testing.assert_close(output, problem.run(surf_conv2d))
+    grad = torch.randn_like(output)
+    needs = (True, True, True, True)
+    grads = cuda_ops._backward(grad, *arguments[:2], *arguments[3:], *needs)
+    expected = problem.gradients(reference.surf_conv2d, grad)
+    for value, (name, wanted) in zip(grads, expected.items(), strict=True):
+        torch.testing.assert_close(value, wanted, msg=name)
+
+
+def test_without_triton_the_reference_runs_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cuda_ops, "backend", lambda: (None, "no module named triton"))
+    monkeypatch.setattr(_fallback, "_warned", False)
+    problem = make_problem(1, 2, 3, (4, 5))
+    arguments = arguments_of(problem)
+    with pytest.warns(RuntimeWarning, match="no module named triton.*pip install triton"):
+        output = cuda_ops._forward(*arguments)
+    assert_same_bits(output, problem.run(reference.surf_conv2d))
+    grad = torch.randn_like(output)
+    grads = cuda_ops._backward(grad, *arguments[:2], *arguments[3:], True, True, True, True)
+    wanted = problem.gradients(reference.surf_conv2d, grad)
+    torch.testing.assert_close(grads[3], wanted["scale"])
+
+
+def test_refuses_the_cpu_outside_the_interpreter() -> None:
+    pytest.importorskip("triton")
+    out = run_python(
+        "import torch, surfconv_ops.triton as backend\n"
+        "x, w = torch.zeros(1, 1, 3, 3), torch.zeros(1, 1, 3, 3)\n"
+        "try: backend.surf_conv2d(x, w, scale=torch.ones(1, 1, 1))\n"
+        "except ValueError as error: print(error)\n",
+        TRITON_INTERPRET="0",
+    )
+    assert "input: expected a CUDA tensor, got one on cpu" in out and "TRITON_INTERPRET" in out
+
+
+def test_fake_cuda_tensors() -> None:
+    """What compile and export trace with."""
+    with FakeTensorMode():
+        x = torch.empty(2, 3, 8, 9, device="cuda")
+        weight = torch.empty(4, 3, 3, 3, device="cuda")
+        scale = depth_to_scale(torch.empty(2, 8, 9, device="cuda"), 2.0)
+        out: Tensor = surf_conv2d(x, weight, scale=scale, padding=1)
+        assert out.device.type == "cuda" and out.shape == (2, 4, 8, 9)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Triton compiles on Linux")
+def test_kernels_compile_for_gpus_that_are_not_here(tmp_path: Path) -> None:
+    pytest.importorskip("triton")
+    environment = os.environ | {"TRITON_CACHE_DIR": str(tmp_path), "TRITON_INTERPRET": "0"}
+    environment["PYTHONPATH"] = str(Path(surfconv_ops.__file__).parents[1])
+    done = subprocess.run(
+        [sys.executable, str(HERE / "triton_compile.py")],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert {row["kernel"] for row in rows} == {"forward", "backward_data", "backward_weight"}
+    for row in rows:
+        assert row.get("stack", 0) == 0, f"spills registers: {row}"
+        assert row["shared"] <= 160 * 1024, f"more than a GPU of sm_80 has: {row}"
+        uses_tensor_cores = row["dtype"] != "torch.float64" and row["groups"] == 1
+        assert bool(row["mma"]) == uses_tensor_cores, row
