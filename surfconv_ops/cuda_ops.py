@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import _fallback
+from . import _fallback, depth_ops
 
 
 @lru_cache(maxsize=1)
@@ -22,25 +22,54 @@ def backend() -> tuple[ModuleType | None, str]:
     return kernels, ""
 
 
-def _forward(input: Tensor, *rest: Any) -> Tensor:
+def _backend_for(tensor: Tensor) -> ModuleType | None:
+    """The module of kernels; without one, a warning that the reference runs instead."""
     kernels, reason = backend()
     if kernels is None:
-        _fallback.warn_once(input.device, reason)
-        return _fallback.forward(input, *rest)
-    output: Tensor = kernels.forward(input, *rest)
+        _fallback.warn_once(tensor.device, reason)
+    return kernels
+
+
+def _forward(input: Tensor, *rest: Any) -> Tensor:
+    kernels = _backend_for(input)
+    output: Tensor = (kernels or _fallback).forward(input, *rest)
     return output
 
 
 def _backward(grad_output: Tensor, *rest: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    kernels, reason = backend()
-    if kernels is None:
-        _fallback.warn_once(grad_output.device, reason)
-        return _fallback.backward(grad_output, *rest)
-    grads: tuple[Tensor, Tensor, Tensor, Tensor] = kernels.backward(grad_output, *rest)
+    kernels = _backend_for(grad_output)
+    grads: tuple[Tensor, Tensor, Tensor, Tensor]
+    grads = (kernels or _fallback).backward(grad_output, *rest)
     return grads
+
+
+def _level_values(depth: Tensor, edges: Tensor, values: Tensor) -> Tensor:
+    # Without Triton PyTorch's own operators do it nearly as well: nothing to warn of.
+    kernels = backend()[0]
+    found: Tensor = (kernels or _fallback).level_values(depth, edges, values)
+    return found
+
+
+def _depth_to_scale(depth: Tensor, *numbers: float) -> Tensor:
+    kernels = backend()[0]
+    scale: Tensor = (kernels.depth_to_scale if kernels else depth_ops.forward_kernel)(
+        depth, *numbers
+    )
+    return scale
+
+
+def _depth_to_scale_backward(grad: Tensor, depth: Tensor, *numbers: float) -> Tensor:
+    kernels = backend()[0]
+    slope: Tensor = (kernels.depth_to_scale_backward if kernels else depth_ops.backward_kernel)(
+        grad, depth, *numbers
+    )
+    return slope
 
 
 def register(library: torch.library.Library) -> None:
     """Register them; without Triton they run the reference, and say so once."""
     library.impl("surf_conv2d", _forward, "CUDA")
     library.impl("surf_conv2d_backward", _backward, "CUDA")
+    library.impl("level_values", _level_values, "CUDA")
+    library.impl("depth_to_scale", _depth_to_scale, "CUDA")
+    library.impl("depth_to_scale_backward", _depth_to_scale_backward, "CUDA")

@@ -28,7 +28,11 @@ from .validation import Window, check_window
 #: Share of clamped valid pixels beyond which clamping is probably a mistake in units.
 CLAMPED_SHARE_TO_WARN = 0.1
 
+#: A GPU has to be waited for to count pixels: a mistake in units shows in the first calls.
+_CUDA_CALLS_TO_CHECK = 16
+
 _warned_of_clamping = False
+_cuda_calls_checked = 0
 
 
 def depth_to_scale(
@@ -50,7 +54,7 @@ def depth_to_scale(
     The gradient flows to ``depth``. It is 0 where the depth is invalid, where the scale is
     clamped, with ``levels``, and where a depth is so small that the derivative is not a finite
     number. When more than 10 % of the valid pixels of a call are clamped, a warning says so,
-    once per process (never while compiling).
+    once per process (never while compiling, and on CUDA in the first calls alone).
 
     Args:
         depth: Metres, floating point.
@@ -230,9 +234,14 @@ def _warn_of_clamping(
     levels: DepthLevels | None,
     limits: ScaleRule,
 ) -> None:
-    global _warned_of_clamping
+    global _cuda_calls_checked, _warned_of_clamping
     if _warned_of_clamping or torch.compiler.is_compiling():
         return
+    if depth.is_cuda:
+        enough = _cuda_calls_checked >= _CUDA_CALLS_TO_CHECK
+        if enough or torch.cuda.is_current_stream_capturing():
+            return
+        _cuda_calls_checked += 1
     metres = depth.detach().to(torch.float64) if levels is None else levels.quantize(depth)
     valid = valid_depth(metres)
     clamped = [valid & ((r / metres < limits.low) | (r / metres > limits.high)) for r in references]

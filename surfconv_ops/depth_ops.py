@@ -101,11 +101,11 @@ def _backward(
     return torch.where(flows, -(grad * reference_depth) * inverse.square(), 0.0)
 
 
-def _forward_kernel(depth: Tensor, *numbers: float) -> Tensor:
+def forward_kernel(depth: Tensor, *numbers: float) -> Tensor:
     return _forward(depth, *numbers).contiguous()
 
 
-def _backward_kernel(grad: Tensor, depth: Tensor, *numbers: float) -> Tensor:
+def backward_kernel(grad: Tensor, depth: Tensor, *numbers: float) -> Tensor:
     return _backward(grad, depth, *numbers).contiguous()
 
 
@@ -246,8 +246,8 @@ def register(library: torch.library.Library) -> None:
     if missing_library_reason is not None:
         library.define(FORWARD_SCHEMA)
         library.define(BACKWARD_SCHEMA)
-    library.impl("depth_to_scale", _forward_kernel, "CompositeExplicitAutograd")
-    library.impl("depth_to_scale_backward", _backward_kernel, "CompositeExplicitAutograd")
+    library.impl("depth_to_scale", forward_kernel, "CompositeExplicitAutograd")
+    library.impl("depth_to_scale_backward", backward_kernel, "CompositeExplicitAutograd")
     forward = torch.ops.surfconv.depth_to_scale.default
     backward = torch.ops.surfconv.depth_to_scale_backward.default
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from . import direct
 from .checks import valid_depth
 
 
@@ -35,7 +36,7 @@ def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
     """
     H, W = depth.shape[-2], depth.shape[-1]
     rows, columns = _axis(H, height, depth.device), _axis(W, width, depth.device)
-    if _values_can_be_read(depth):
+    if _values_may_be_read(depth):
         # Most pixels are no holes, and only holes need a search.
         picked = depth.index_select(-2, rows.first).index_select(-1, columns.first)
         if rows.largest == columns.largest == 1:
@@ -98,13 +99,6 @@ def _nearest_valid(
     return start + offset[torch.where(best < tall * wide, best, 0)]
 
 
-def _values_can_be_read(depth: Tensor) -> bool:
-    """Whether a shape may depend on values: not in traces and captures, not under torch.func."""
-    return not (
-        torch.compiler.is_compiling()
-        or torch._C._get_tracing_state() is not None
-        or depth.is_meta
-        or torch._C._functorch.maybe_current_level() is not None
-        or torch._C._len_torch_dispatch_stack() > 0
-        or (depth.is_cuda and torch.cuda.is_current_stream_capturing())
-    )
+def _values_may_be_read(depth: Tensor) -> bool:
+    """Whether a shape may depend on values. A GPU would have to be waited for."""
+    return not (direct.watched() or depth.is_meta or depth.is_cuda)

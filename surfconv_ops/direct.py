@@ -19,6 +19,16 @@ _below_autograd: Callable[[], AbstractContextManager[Any]] = getattr(
 )
 
 
+def watched() -> bool:
+    """Whether something records or replaces operations: a compiler, a trace, torch.func, a mode."""
+    return (
+        torch.compiler.is_compiling()
+        or _transforms_active()
+        or torch._C._get_tracing_state() is not None
+        or torch._C._len_torch_dispatch_stack() > 0
+    )
+
+
 def has_tangent(args: tuple[Any, ...]) -> bool:
     """Whether forward-mode differentiation is under way for one of ``args``."""
     if getattr(forward_ad, "_current_level", 0) < 0:

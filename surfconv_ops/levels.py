@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import _fallback
+from . import _fallback, direct
 from .checks import check_depth_tensor, check_finite, check_positive
 
 _FORMAT = "surfconv_ops.DepthLevels"
@@ -120,8 +121,10 @@ class DepthLevels:
         double = depth.dtype == torch.float64
         wide = depth if double else depth.to(torch.float32)
         edges = self.edges if double else self._single_edges
-        boundaries = torch.tensor(edges, dtype=wide.dtype, device=wide.device)
-        table = torch.tensor((*values, invalid), dtype=wide.dtype, device=wide.device)
+        # What is watched must not meet tensors from outside, nor leave its own in the cache.
+        tensor = _new_tensor if direct.watched() else _kept_tensor
+        boundaries = tensor(edges, wide.dtype, wide.device)
+        table = tensor((*values, invalid), wide.dtype, wide.device)
         # A compiler fuses the plain form with what surrounds it.
         plain = torch.compiler.is_compiling()
         call = _fallback.level_values if plain else torch.ops.surfconv.level_values
@@ -186,6 +189,18 @@ class DepthLevels:
             return cls(content["edges"], content["centers"], content.get("gamma"))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"path: {os.fspath(path)} holds no valid levels: {error}") from error
+
+
+def _new_tensor(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    return torch.tensor(values, dtype=dtype, device=device)
+
+
+@lru_cache(maxsize=256)
+def _kept_tensor(values: tuple[float, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The same tensor every time: a copy to a GPU costs more than looking up, and none may be
+    made while a graph is captured."""
+    with torch.inference_mode(False):
+        return _new_tensor(values, dtype, device)
 
 
 def _round_down(edges: tuple[float, ...]) -> tuple[float, ...]:

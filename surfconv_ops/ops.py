@@ -54,8 +54,8 @@ class Library(torch.library.Library):
 # Kept for the life of the process: what it registered goes when it goes.
 _library = Library("surfconv", "FRAGMENT")
 _fallback.register(_library)
-cuda_ops.register(_library)
 depth_ops.register(_library)
+cuda_ops.register(_library)
 _forward_op = torch.ops.surfconv.surf_conv2d.default
 _backward_op = torch.ops.surfconv.surf_conv2d_backward.default
 

@@ -19,7 +19,8 @@ from helpers import Problem, assert_same_bits, make_problem
 from surfconv_ops import _fallback, cuda_ops, depth_to_scale, reference, surf_conv2d
 from surfconv_ops.validation import check_surf_conv2d
 
-OPERATORS = ("surf_conv2d", "surf_conv2d_backward")
+OPERATORS = ("surf_conv2d", "surf_conv2d_backward", "level_values", "depth_to_scale",
+             "depth_to_scale_backward")  # fmt: skip
 HERE = Path(__file__).parent
 
 
@@ -89,6 +90,41 @@ def test_the_registered_functions_run_the_kernels(monkeypatch: pytest.MonkeyPatc
     expected = problem.gradients(reference.surf_conv2d, grad)
     for value, (name, wanted) in zip(grads, expected.items(), strict=True):
         torch.testing.assert_close(value, wanted, msg=name)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("limits", [(0.0, 3e38), (0.4, 2.0)], ids=str)
+@pytest.mark.parametrize("reference_depth", [2.0, 1e-3])
+def test_scale_of_depth(dtype: torch.dtype, limits: Any, reference_depth: float) -> None:
+    """The same bits as on the CPU, whose test has an oracle."""
+    pytest.importorskip("triton")
+    odd = [0.0, -1.0, torch.nan, torch.inf, -torch.inf, 1e-45, 1e-38, 1e-20, 1e30, 3.4e38]
+    depth = torch.cat((torch.tensor(odd), torch.rand(1490) * 9)).to(dtype).view(30, 50).t()
+    grad = torch.randn(50, 30, dtype=dtype)
+    numbers = (*limits, 1e30)
+    ops = torch.ops.surfconv
+    scale = cuda_ops._depth_to_scale(depth, reference_depth, 0.25, *numbers)
+    assert_same_bits(scale, ops.depth_to_scale(depth, reference_depth, 0.25, *numbers))
+    slope = cuda_ops._depth_to_scale_backward(grad, depth, reference_depth, *numbers)
+    wanted = ops.depth_to_scale_backward(grad, depth, reference_depth, *numbers)
+    assert slope.any()
+    assert_same_bits(slope, wanted)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("levels", [1, 2, 5])
+def test_values_of_levels(dtype: torch.dtype, levels: int) -> None:
+    pytest.importorskip("triton")
+    edges = torch.arange(1, levels, dtype=dtype) * 1.5
+    values = torch.arange(levels + 1, dtype=dtype) + 0.25
+    depth = torch.cat(
+        (edges, torch.tensor([0.0, -2.0, torch.nan, torch.inf]), torch.rand(1100) * 9)
+    )
+    depth = depth.to(dtype)
+    found = cuda_ops._level_values(depth, edges, values)
+    assert_same_bits(found, torch.ops.surfconv.level_values(depth, edges, values))
+    empty = cuda_ops._level_values(depth[:0], edges, values)
+    assert empty.shape == (0,)
 
 
 def test_without_triton_the_reference_runs_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -174,6 +174,15 @@ def test_one_side_for_all_taps_on_pixels(kernel: int) -> None:
     torch.testing.assert_close(ours, problem.gradients(reference.surf_conv2d, grad)["scale"])
 
 
+def test_far_taps() -> None:
+    """Offsets that would wrap to a place inside the image if they were cut to 32 bits."""
+    problem = make_problem(1, 2, 3, (6, 7), dtype=torch.float64)
+    far = torch.tensor([2.0**31, 2.0**32 - 1, 2.0**32 + 1, 2.0**30, 2.0**40, 2.0**53])
+    problem.scale.copy_(torch.cat((far, -far))[torch.arange(42) % 12].view(1, 1, 6, 7))
+    problem.check_forward(operator)
+    problem.check_gradients(operator)
+
+
 def test_scale_one_hides_what_conv2d_does_not_see() -> None:
     problem = make_problem(scale="ones")
     problem.input[0, 0, 2, 3] = torch.inf

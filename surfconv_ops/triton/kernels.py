@@ -1,9 +1,6 @@
-"""Forward and backward on one device: memory, launches, and what is left to torch's operators."""
+"""The registered operators on one device: memory, launches, what is left to torch's operators."""
 
 from __future__ import annotations
-
-from contextlib import AbstractContextManager, nullcontext
-from typing import Any
 
 import torch
 import triton
@@ -15,18 +12,18 @@ from .accumulate import Sums
 from .backward_data import backward_data_kernel
 from .backward_weight import backward_weight_kernel
 from .conv import Conv, channels_innermost, limits_of_view
+from .depth_to_scale import depth_to_scale, depth_to_scale_backward
 from .forward import forward_kernel
 from .interpreter import in_float32, needs_float32
+from .launch import on_device
+from .level_values import level_values
 from .tiles import Tiles, data_tiles, fastest, forward_tiles, weight_tiles
+
+__all__ = ["backward", "depth_to_scale", "depth_to_scale_backward", "forward", "level_values"]
 
 #: Programs that sum the gradient of the weight. Not the device's own number: what is added to
 #: what, and so the last bit, is to depend on the shapes alone.
 _WEIGHT_PROGRAMS = 1024
-
-
-def _on_device(tensor: Tensor) -> AbstractContextManager[Any]:
-    """Triton launches on the current device, which need not be the tensor's."""
-    return torch.cuda.device(tensor.device) if tensor.is_cuda else nullcontext()
 
 
 def forward(
@@ -73,7 +70,7 @@ def forward(
                 *arguments, **conv.constants(), UNROLL=tiles.unrolled, **tiles.constants()
             )
 
-        with _on_device(input):
+        with on_device(input):
             variant = (guide is not None, image.dtype)
             run(fastest("forward", conv, variant, forward_tiles(conv), run, input.device))
     return lay_out(output.permute(0, 3, 1, 2), memory_format_of(input))
@@ -105,7 +102,7 @@ def backward(
         return narrow[0], narrow[1], narrow[2], narrow[3]
     conv = Conv.of(input, weight, scale, stride, padding, dilation, groups)
     grads = [input.new_empty(0), weight.new_empty(0), weight.new_empty(0), scale.new_empty(0)]
-    with _on_device(input):
+    with on_device(input):
         outer, image = channels_innermost(grad_output), channels_innermost(input)
         scale_in_order = scale.contiguous()
         view = limits_of_view(guide, guide_tolerance, conv.compute_dtype)
