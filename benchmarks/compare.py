@@ -15,7 +15,10 @@ from report import read_rows
 from rows import Row
 
 #: Facts without which times of two runs say nothing about a change of the code.
-SAME_MACHINE = ("cpu", "cores", "torch", "torch_cpu_capability", "surfconv_cpu_capability")
+SAME_MACHINE = (
+    *("cpu", "cores", "torch", "torch_cpu_capability", "surfconv_cpu_capability"),
+    *("gpu", "driver", "cuda", "cudnn", "triton", "torchvision"),
+)
 SLOWER, FASTER, MORE, LESS, WITHIN = "SLOWER", "faster", "MORE", "less", ""
 
 
