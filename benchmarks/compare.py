@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from document import table
 from report import read_rows
 from rows import Row
+from tables import table
 
 #: Facts without which times of two runs say nothing about a change of the code.
 SAME_MACHINE = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import torch
@@ -26,7 +26,7 @@ def _try_deform_conv2d(function: Any, device: str, dtype: torch.dtype) -> None:
     function(image, offset, weight, padding=1)
 
 
-@lru_cache(maxsize=None)
+@cache
 def deform_conv2d(device: str = "cpu") -> tuple[Any, str]:
     """torchvision's function, or None and why it cannot be used on a type of device."""
     try:
@@ -40,7 +40,7 @@ def deform_conv2d(device: str = "cpu") -> tuple[Any, str]:
     return function, ""
 
 
-@lru_cache(maxsize=None)
+@cache
 def deform_dtype(device: str, dtype: torch.dtype) -> torch.dtype:
     """What deform_conv2d computes in: float32, as under autocast, where it lacks the dtype."""
     try:

@@ -83,7 +83,6 @@ class Plan:
         minimum: rounds that everybody takes part in.
         maximum: rounds after which a fast job ends before its seconds do.
         shrink: divisor of all frame sizes; above 1 only where numbers do not matter (tests).
-        device: cpu or cuda.
     """
 
     quick: bool
@@ -92,7 +91,6 @@ class Plan:
     minimum: int
     maximum: int
     shrink: int = 1
-    device: str = "cpu"
 
     @property
     def total(self) -> float:
@@ -106,4 +104,4 @@ def make_plan(
     table = SECONDS[device][quick]
     seconds = {name: table[name] for name in ("gate", *suites)}
     minimum, maximum = (2 if quick else 4, 60) if device == "cpu" else (5 if quick else 10, 200)
-    return Plan(quick, threads, seconds, minimum, maximum, device=device)
+    return Plan(quick, threads, seconds, minimum, maximum)

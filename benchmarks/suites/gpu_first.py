@@ -15,7 +15,7 @@ from candidates import BASELINE
 from devices import Device
 from frames import smooth_kinds
 from plan import Plan
-from rows import Key, Row
+from rows import Row
 from suites.job import Job, Suite
 from suites.series import LAYOUT, layers_of, numerics_of
 

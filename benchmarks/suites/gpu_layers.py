@@ -57,7 +57,7 @@ def suite(device: Device) -> Suite:
     """The suite on a device."""
 
     def job(layer: Layer, name: str, direction: str, plan: Plan) -> Job:
-        series = series_of(direction, plan)
+        series = series_of(direction, plan, device)
         return Job(
             f"{layer.name} {name} {direction}",
             work_of_layer(layer, name, direction),

@@ -51,7 +51,7 @@ def suite(device: Device) -> Suite:
     """The suite on a device."""
 
     def job(layer: Layer, name: str, direction: str, plan: Plan) -> Job:
-        series = series_of(direction, plan, memory=True)
+        series = series_of(direction, plan, device, memory=True)
         return Job(
             f"{layer.name} {name} {direction}",
             1.0,

@@ -14,7 +14,6 @@ from cases import LAYOUTS
 from devices import Device, numerics
 from frames import Scene, make_scene, smooth_kinds
 from net import PARAMETERS
-from peers import PYRAMID
 from plan import Limits, Plan
 from rows import Key, Row, make_row
 from suites.job import BACKWARD_WORK, Job, Suite

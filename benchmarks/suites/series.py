@@ -82,7 +82,7 @@ class Series:
         return targets.GPU_PRICES[direction] if self.ours else None
 
 
-def series_of(direction: str, plan: Plan, *, memory: bool = False) -> list[Series]:
+def series_of(direction: str, plan: Plan, device: Device, *, memory: bool = False) -> list[Series]:
     """What runs, the baseline first; contiguous input and random depth cost no other memory."""
     smooth = smooth_kinds()[0]
     ours = [Series(CONTINUOUS, smooth), Series(LEVELS, smooth)]
@@ -94,7 +94,7 @@ def series_of(direction: str, plan: Plan, *, memory: bool = False) -> list[Serie
         ours.append(Series(SAME_LEVEL, smooth))
         if not memory:
             ours += [Series(BASELINE, "", "contiguous"), Series(CONTINUOUS, smooth, "contiguous")]
-    lacking = peers.unavailable(plan.device)
+    lacking = peers.unavailable(device.where.type)
     others = [
         Series(name, smooth, OWN_LAYOUTS.get(name, LAYOUT))
         for name in (DEFORM, DEFORM_ALONE, REFERENCE, PYRAMID)
