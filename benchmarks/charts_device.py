@@ -169,10 +169,13 @@ def net(rows: Sequence[Row]) -> Any:
                 place = numerics.index(row.dtype) + shift
                 axes.barh(place, row.value, 0.9 * height, color=colours[row.subject])
                 told = f" {row.value:.2f} ms" + (f" = {row.ratio:.2f}x" if row.ratio else "")
-                axes.text(row.value, place, told, va="center", fontsize=8, bbox=BOX, zorder=3)
+                limit = 0.0
                 if row.target is not None:
+                    limit = row.target * base[row.dtype]
                     edges = [place - height / 2, place + height / 2]
-                    axes.plot([row.target * base[row.dtype]] * 2, edges, **TARGET)
+                    axes.plot([limit] * 2, edges, **TARGET)
+                end = max(row.value, limit)
+                axes.text(end, place, told, va="center", fontsize=8, bbox=BOX, zorder=3)
             axes.set_yticks(range(len(numerics)), [TITLES.get(n, n) for n in numerics], fontsize=8)
             axes.invert_yaxis()
             axes.set_xlim(0, 1.35 * max(row.value for row in own))

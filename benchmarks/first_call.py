@@ -43,7 +43,9 @@ def first_calls(layer: Layer, name: str, where: torch.device) -> dict[str, dict[
     found: dict[str, dict[str, list[float]]] = {}
     with numerics(name) as dtype:
         # The device's context and its libraries' loading belong to neither subject.
-        tiny = make_candidate(BASELINE, replace(layer, height=8, width=8), LAYOUT, device=where)
+        tiny = make_candidate(
+            BASELINE, replace(layer, height=8, width=8), LAYOUT, None, dtype, where
+        )
         tiny.both()()
         for subject in (BASELINE, CONTINUOUS):
             candidate = make_candidate(subject, layer, LAYOUT, scene, dtype, where)

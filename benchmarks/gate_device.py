@@ -47,6 +47,8 @@ TOLERANCES = {
 }
 #: The reference and the relation at points are both float64.
 EXACT = 1e-10
+#: Numerics that more kinds of depth, and guides, are checked in: the truth takes its time.
+WITH_AND_WITHOUT_TENSOR_CORES = ("float32", "bfloat16")
 #: Dozens of layers, one after the other.
 NET_TOLERANCE = 1e-3
 
@@ -165,20 +167,22 @@ def gate(plan: Plan, device: Device) -> list[tuple[str, Callable[[], list[Check]
         jobs.append((label, lambda: function(*arguments)))
 
     smooth = smooth_kinds()[0]
-    pairs = [(CONTINUOUS, smooth)]
+    every = numerics_of(plan)
+    pairs = [(CONTINUOUS, smooth, every)]
     if not plan.quick:
-        pairs += [(CONTINUOUS, RANDOM), (SAME_LEVEL, smooth)]
+        pairs += [(CONTINUOUS, RANDOM, WITH_AND_WITHOUT_TENSOR_CORES)]
+        pairs += [(SAME_LEVEL, smooth, WITH_AND_WITHOUT_TENSOR_CORES)]
     layouts = [LAYOUT] if plan.quick else list(LAYOUTS)
     channels = cases.VOXEL_CHANNELS
     frame = Layer("frame", 1, channels, *FRAME, channels).shrunk(plan.shrink)
     layers = layers_of(plan)
     for layer in (*layers, frame):
         add(layer.name, lambda layer=layer: exactly(lambda: at_scale_one(layer, device.where)))
-        for subject, kind in pairs:
+        for subject, kind, names in pairs:
             scene = scene_of(layer, make_scene, kind)
-            for name in numerics_of(plan):
+            for name in names:
                 add(
-                    f"{layer.name} {name}",
+                    f"{layer.name} {name}, {subject}, {kind} depth",
                     against_reference, layer, subject, scene, name, layouts, device,
                 )  # fmt: skip
     first = layers[-1]

@@ -42,7 +42,7 @@ QUICK_SECONDS = {
 #: With --device cuda: adds up to about 6 minutes, kernels compiled on the way not counted.
 DEVICE_FULL_SECONDS = {
     "gate": 60.0,
-    "gpu_layers": 150.0,
+    "gpu_layers": 120.0,
     "gpu_memory": 25.0,
     "gpu_net": 30.0,
     "gpu_conv3d": 15.0,

@@ -84,7 +84,7 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     cores = os.cpu_count() or 1
     add("--threads", type=count, nargs="+", metavar="N",
         default=list(range(1, min(cores, DEFAULT_THREADS) + 1)),
-        help="thread counts on the CPU; single runs use the first (default: %(default)s)")  # fmt: skip
+        help="CPU thread counts; single runs use the first (default: %(default)s)")  # fmt: skip
     add("--device", choices=["cpu", "cuda"], default="cpu",
         help="where to measure; cuda is the current GPU (default: %(default)s)")  # fmt: skip
     add("--suites", nargs="+", choices=[*SUITES, *DEVICE_SUITES], metavar="NAME",

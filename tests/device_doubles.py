@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import ModuleType
 from typing import Any
 
+import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, grid_sample
 from torch.utils._python_dispatch import TorchDispatchMode
 
+import cases
+import peers
+from cases import Layer
+from plan import Plan
 from timing import HostClock
+
+#: Divisor of the sides of the net's and of nn.Conv3d's frames.
+SHRINK = 6
 
 
 class _Largest(TorchDispatchMode):
@@ -85,9 +95,24 @@ def deform_conv2d(
     return total if bias is None else total + bias[:, None, None]
 
 
+def tiny_plan(*names: str, quick: bool = True) -> Plan:
+    """Two rounds of some device suites."""
+    return Plan(quick, (1,), dict.fromkeys(("gate", *names), 0.0), 2, 2, shrink=SHRINK)
+
+
 @contextmanager
-def uncached(*functions: Any) -> Iterator[None]:
-    """Functions that remember their results forget them before and after."""
+def tiny(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Device suites of layers of a few channels, and a torchvision."""
+    layers = (Layer("c4", 2, 4, 9, 12, 4), Layer("c8", 1, 8, 8, 10, 8))
+    monkeypatch.setattr(cases, "GPU", {layer.name: layer for layer in layers})
+    monkeypatch.setattr(cases, "GPU_QUICK", ("c8",))
+    monkeypatch.setattr(cases, "GPU_NET_BATCHES", (2, 1))
+    package, operators = ModuleType("torchvision"), ModuleType("torchvision.ops")
+    operators.deform_conv2d = deform_conv2d  # type: ignore[attr-defined]
+    package.__version__ = "a double's"  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "torchvision", package)
+    monkeypatch.setitem(sys.modules, "torchvision.ops", operators)
+    functions = (peers.deform_conv2d, peers.deform_dtype)
     for function in functions:
         function.cache_clear()
     try:
