@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
 
 import candidates
 import cases
@@ -32,6 +31,7 @@ from rows import Row
 from suites import gpu_first, series
 from surfconv_ops import SurfConv2d
 
+ROOT = Path(__file__).parents[1]
 ONCE = Limits(seconds=0.0, minimum=2, maximum=2)
 STEP = "forward + backward"
 
@@ -237,7 +237,8 @@ def test_a_quick_run_on_a_real_device(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr[-3000:]
     data, found = report.read_rows(tmp_path / "results.json")
-    assert (data["gate"]["passed"] and "GPU" in data["machine"]["gpu"]) or data["machine"]["gpu"]
+    assert data["gate"]["passed"]
+    assert data["machine"]["gpu"] == torch.cuda.get_device_properties(0).name
     assert {row.suite for row in found} == set(suites.DEVICE_SUITES)
     plain = [row for row in found if row.suite == "gpu_memory" and row.subject == BASELINE]
     for row in plain:

@@ -1,4 +1,4 @@
-"""What the benchmark of a device consists of: its gate, its targets, what it knows of the device."""
+"""The parts of a device's benchmark: its gate, its targets, what it knows of the device."""
 
 from __future__ import annotations
 
@@ -100,24 +100,30 @@ def test_the_gate_holds_every_timed_shape_peers_and_nets() -> None:
 
 
 def test_wins_and_losses_target_by_target() -> None:
-    key = {"suite": "s", "table": "t", "direction": "forward", "layout": "channels_last"}
-    goal = {"target": 1.6, "target_sense": "at most", "baseline": "nn.Conv2d, channels_last"}
-    ours = [
-        Row(case="c64 8x", subject=CONTINUOUS, dtype="tf32", ratio=1.2, verdict="met", **key, **goal),
-        Row(case="c8 8x", subject=CONTINUOUS, dtype="tf32", ratio=1.9, verdict="missed", **key, **goal),
-    ]  # fmt: skip
-    goal = {"target": 3.0, "target_sense": "at least", "baseline": CONTINUOUS}
-    key["layout"] = "contiguous"
-    peer = [
-        Row(case="c64 8x", subject=peers.DEFORM, dtype="tf32", ratio=r, verdict="met", **key, **goal)
-        for r in (3.5, 9.0)
-    ]  # fmt: skip
-    lines = document_device.by_target([*ours, *peer])[2:]
-    assert lines == [
+    def row(case: str, subject: str, ratio: float, verdict: str) -> Row:
+        leads = subject == peers.DEFORM
+        return Row(
+            suite="s",
+            table="t",
+            case=case,
+            subject=subject,
+            direction="forward",
+            layout="contiguous" if leads else "channels_last",
+            dtype="tf32",
+            baseline=CONTINUOUS if leads else "nn.Conv2d, channels_last",
+            ratio=ratio,
+            target=3.0 if leads else 1.6,
+            target_sense="at least" if leads else "at most",
+            verdict=verdict,
+        )
+
+    found = [row("c64 8x", CONTINUOUS, 1.2, "met"), row("c8 8x", CONTINUOUS, 1.9, "missed")]
+    found += [row("c64 8x", peers.DEFORM, 3.5, "met"), row("c8 8x", peers.DEFORM, 9.0, "met")]
+    assert document_device.by_target(found)[2:] == [
         "| s | SurfConv2d continuous | forward | at most 1.6 x nn.Conv2d | 1 | **1** "
         "| 1.20 (c64, tf32) | 1.90 (c8, tf32) |",
         "| s | deform_conv2d | forward | at least 3 x SurfConv2d continuous | 2 | 0 "
-        "| 9.00 (c64, tf32) | 3.50 (c64, tf32) |",
+        "| 9.00 (c8, tf32) | 3.50 (c64, tf32) |",
     ]
 
 
@@ -129,11 +135,14 @@ def test_numerics_are_set_and_restored() -> None:
 
     before = state()
     for name, allowed in (("float32", False), ("tf32", True), ("bfloat16", True)):
-        with pytest.raises(KeyError), devices.numerics(name) as dtype:
+        with devices.numerics(name) as dtype:
             assert state() == (allowed, allowed, True)
             assert str(dtype) == f"torch.{name}".replace("tf32", "float32")
-            raise KeyError
         assert state() == before
+    failing = devices.numerics("tf32")
+    failing.__enter__()
+    assert failing.__exit__(KeyError, KeyError("inside"), None) is False
+    assert state() == before
 
 
 def test_a_timing_keeps_what_the_device_and_the_processor_took() -> None:
