@@ -173,9 +173,9 @@ def net(rows: Sequence[Row]) -> Any:
                 if row.target is not None:
                     limit = row.target * base[row.dtype]
                     edges = [place - height / 2, place + height / 2]
-                    axes.plot([limit] * 2, edges, **TARGET)
+                    axes.plot([limit] * 2, edges, zorder=4, **TARGET)
                 end = max(row.value, limit)
-                axes.text(end, place, told, va="center", fontsize=8, bbox=BOX, zorder=3)
+                axes.text(end, place, told, va="center", fontsize=8)
             axes.set_yticks(range(len(numerics)), [TITLES.get(n, n) for n in numerics], fontsize=8)
             axes.invert_yaxis()
             axes.set_xlim(0, 1.35 * max(row.value for row in own))

@@ -23,11 +23,12 @@ def series_name(row: Row) -> str:
 
 def by_target(rows: Sequence[Row]) -> list[str]:
     """Wins and losses: one line for every limit and what it holds for, with the best and worst."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
+    groups: dict[tuple[str, str, str, str], list[Row]] = {}
     for row in rows:
         if row.verdict:
             base = row.baseline.split(", channels_last")[0]
-            limit = f"{row.target_sense} {row.target:g} x {base}"
+            measured = "time" if row.unit == "ms" else "peak memory"
+            limit = f"{row.target_sense} {row.target:g} x {base}'s {measured}"
             place = (row.suite, series_name(row), row.direction, limit)
             groups.setdefault(place, []).append(row)
     header = ("suite", "what", "direction", "target", "met", "missed", "best", "worst")

@@ -32,6 +32,8 @@ from suites import gpu_first, series
 from surfconv_ops import SurfConv2d
 
 ROOT = Path(__file__).parents[1]
+#: The layers as they are, before the tests make them small.
+REAL_LAYERS = {str(layer): layer for layer in cases.GPU.values()}
 ONCE = Limits(seconds=0.0, minimum=2, maximum=2)
 STEP = "forward + backward"
 
@@ -73,6 +75,8 @@ def test_layers_stand_beside_everything_that_one_could_pick() -> None:
                 extra = {series.FIXED_DEPTH} if direction == STEP else set()
                 assert {row.subject for row in own} == everything | extra
                 assert sum(row.layout == "contiguous" for row in own) == 4
+                bases = {row.baseline for row in own if row.layout == "contiguous"}
+                assert bases == {"", f"{BASELINE}, contiguous", f"{CONTINUOUS}, channels_last"}
                 goals = {(row.subject, row.target) for row in own if row.target is not None}
                 price, lead = (1.6, 3.0) if direction == "forward" else (2.0, 4.0)
                 ours = {s for s in everything | extra if s.startswith("SurfConv2d")}
@@ -94,6 +98,12 @@ def test_memory_is_judged_against_conv2d() -> None:
         ours = values[CONTINUOUS, numerics, "forward"]
         assert ours.value * 2**20 >= width * output + 4 * size.pixels
         assert ours.ratio == pytest.approx(ours.value / plain.value) and ours.target == 1.15
+        # The depth's gradient is of the depth's size, and its scale's as well.
+        less = (
+            values[CONTINUOUS, numerics, STEP].value
+            - values[series.FIXED_DEPTH, numerics, STEP].value
+        )
+        assert less * 2**20 >= 2 * 4 * size.pixels
         reference = values[peers.REFERENCE, numerics, STEP]
         assert reference.ratio is not None and reference.ratio > 9 and not reference.verdict
 
@@ -242,6 +252,6 @@ def test_a_quick_run_on_a_real_device(tmp_path: Path) -> None:
     assert {row.suite for row in found} == set(suites.DEVICE_SUITES)
     plain = [row for row in found if row.suite == "gpu_memory" and row.subject == BASELINE]
     for row in plain:
-        layer = next(layer for layer in cases.GPU.values() if str(layer) == row.case)
+        layer = REAL_LAYERS[row.case]
         width = 2 if row.dtype == "bfloat16" else 4
         assert row.value >= layer.pixels * layer.channels_out * width / 2**20

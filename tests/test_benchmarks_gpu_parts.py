@@ -120,9 +120,9 @@ def test_wins_and_losses_target_by_target() -> None:
     found = [row("c64 8x", CONTINUOUS, 1.2, "met"), row("c8 8x", CONTINUOUS, 1.9, "missed")]
     found += [row("c64 8x", peers.DEFORM, 3.5, "met"), row("c8 8x", peers.DEFORM, 9.0, "met")]
     assert document_device.by_target(found)[2:] == [
-        "| s | SurfConv2d continuous | forward | at most 1.6 x nn.Conv2d | 1 | **1** "
+        "| s | SurfConv2d continuous | forward | at most 1.6 x nn.Conv2d's time | 1 | **1** "
         "| 1.20 (c64, tf32) | 1.90 (c8, tf32) |",
-        "| s | deform_conv2d | forward | at least 3 x SurfConv2d continuous | 2 | 0 "
+        "| s | deform_conv2d | forward | at least 3 x SurfConv2d continuous's time | 2 | 0 "
         "| 9.00 (c8, tf32) | 3.50 (c64, tf32) |",
     ]
 
@@ -163,6 +163,55 @@ def test_suites_belong_to_their_device(capsys: pytest.CaptureFixture[str]) -> No
             run.parse_arguments(arguments)
         assert stopped.value.code == 2
         assert f"{arguments[-1]} is not measured with --device" in capsys.readouterr().err
+
+
+def test_cudas_clock_and_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    order: list[str] = []
+
+    class Event:
+        def __init__(self, enable_timing: bool) -> None:
+            assert enable_timing
+
+        def record(self) -> None:
+            order.append("event")
+
+        def synchronize(self) -> None:
+            order.append("wait")
+
+        def elapsed_time(self, end: Event) -> float:
+            assert order[-1] == "wait" and end is not self
+            return 4.0
+
+    class Buffer:
+        def zero_(self) -> None:
+            order.append("flush")
+
+    class About:
+        L2_cache_size = 300 * 2**20
+
+    def buffer(size: int, *, dtype: torch.dtype, device: torch.device) -> Buffer:
+        assert size * dtype.itemsize == 2 * About.L2_cache_size and device.index == 3
+        return Buffer()
+
+    used = iter((10, 70))
+    monkeypatch.setattr(torch, "empty", buffer)
+    for name, fake in {
+        "current_device": lambda: 3,
+        "get_device_properties": lambda _: About,
+        "synchronize": lambda _: order.append("idle"),
+        "Event": Event,
+        "reset_peak_memory_stats": lambda _: order.append("reset"),
+        "memory_allocated": lambda _: next(used),
+        "max_memory_allocated": lambda _: next(used),
+    }.items():
+        monkeypatch.setattr(torch.cuda, name, fake)
+    device = devices.Cuda()
+    seconds, host = device.time(lambda: order.append("call"))
+    assert seconds == 0.004 and 0 < host < 1
+    assert order == ["idle", *["flush"] * devices.FLUSHES, "event", "call", "event", "wait"]
+    order.clear()
+    assert device.peak(lambda: order.append("call")) == 60
+    assert order == ["idle", "reset", "call", "idle"]
 
 
 def test_the_device_is_described(monkeypatch: pytest.MonkeyPatch) -> None:
