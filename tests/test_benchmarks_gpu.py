@@ -117,6 +117,9 @@ def test_nets_and_volumes(name: str) -> None:
         assert {row.subject for row in found} == {BASELINE, LEVELS, CONTINUOUS, peers.PYRAMID}
         assert {row.unit for row in found} == {"ms", "MiB"}
         assert sum(bool(row.verdict) for row in found) == 2 * 2 * 2 * 2
+        jobs = suites.device_suites(Processor())[name].jobs(tiny_plan(name, quick=False))
+        job = next(job for job in jobs if job.label == "batch 1 float16 forward")
+        assert not any(row.verdict for row in job.measure(ONCE))
     else:
         assert {row.subject for row in found} == {CONTINUOUS, peers.CONV3D}
 
