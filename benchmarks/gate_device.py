@@ -37,8 +37,8 @@ from suites.series import LAYOUT, layers_of, numerics_of
 from surfconv_ops import reference
 
 #: Relative RMS. float32: sums of as many terms as the batch has pixels, 2**-24 times the root of
-#: 614,400 where they come one after another. The others: two operands cut to tf32's 10 bits; two roundings, of a sample and of the result,
-#: to a half type. A wrong tap is off by 1e-2 and more.
+#: 614,400 where they come one after another. The others: two operands cut to tf32's 10 bits; two
+#: roundings, of a sample and of the result, to a half type. A wrong tap is off by 1e-2 and more.
 TOLERANCES = {
     "float32": 5e-5,
     "tf32": 2.0**-9,
