@@ -237,6 +237,7 @@ def test_without_a_device_the_program_says_so(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device here")
 def test_a_quick_run_on_a_real_device(tmp_path: Path) -> None:
     # A process of its own: what stands in for torchvision and for layers stays here.
