@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,11 +37,15 @@ def surf_options(subject: str, scene: Scene) -> dict[str, Any]:
 
 @dataclass
 class Candidate:
-    """A module and its inputs; `depth` is None where the module takes none."""
+    """A module and its inputs; `depth` is None where the module takes none.
+
+    `fixed_depth` is depth that nobody asks a gradient of.
+    """
 
     module: nn.Module
     input: Tensor
     depth: Tensor | None = None
+    fixed_depth: bool = False
 
     def forward(self) -> Tensor:
         output: Tensor = (
@@ -50,8 +54,8 @@ class Candidate:
         return output
 
     def leaves(self) -> list[Tensor]:
-        """Everything that can receive a gradient: input, weight, bias and depth."""
-        depth = [] if self.depth is None else [self.depth]
+        """Everything that is to receive a gradient: input, weight, bias and depth."""
+        depth = [] if self.depth is None or self.fixed_depth else [self.depth]
         return [self.input, *self.module.parameters(), *depth]
 
     def inference(self) -> Callable[[], object]:
@@ -97,13 +101,23 @@ class Candidate:
 def random_like(tensor: Tensor) -> Tensor:
     """Normal numbers of a tensor's shape, the same ones whatever its layout and dtype."""
     # randn_like draws in memory order, which would give layouts different numbers.
-    return torch.randn(tensor.shape, generator=torch.Generator().manual_seed(5)).to(tensor.dtype)
+    return normal(tensor.shape, 5, tensor.device).to(tensor.dtype)
 
 
-def make_input(layer: Layer, layout: str, dtype: torch.dtype = torch.float32) -> Tensor:
+def normal(size: Sequence[int], seed: int, device: torch.device | str) -> Tensor:
+    """Normal float32 numbers, drawn on the device."""
+    generator = torch.Generator(device).manual_seed(seed)
+    return torch.randn(size, generator=generator, device=device)
+
+
+def make_input(
+    layer: Layer,
+    layout: str,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Tensor:
     """The layer's input, the same numbers in every layout."""
-    size = (layer.batch, layer.channels_in, layer.height, layer.width)
-    values = torch.randn(size, generator=torch.Generator().manual_seed(2))
+    values = normal((layer.batch, layer.channels_in, layer.height, layer.width), 2, device)
     return values.to(dtype).contiguous(memory_format=LAYOUTS[layout])
 
 
@@ -134,6 +148,7 @@ def make_candidate(
     layout: str,
     scene: Scene | None = None,
     dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
 ) -> Candidate:
     """nn.Conv2d or SurfConv2d in one of its modes, all with equal weights and inputs.
 
@@ -143,6 +158,7 @@ def make_candidate(
         layout: a key of `LAYOUTS`, for input and weight.
         scene: depth; only `BASELINE` goes without.
         dtype: of input and weight.
+        device: of all tensors.
 
     Returns:
         The candidate, with tensors of its own.
@@ -152,6 +168,6 @@ def make_candidate(
     else:
         assert scene is not None
         module = make_conv(layer, SurfConv2d, **surf_options(subject, scene))
-        depth = scene.depth.clone()
-    module = module.to(dtype=dtype, memory_format=LAYOUTS[layout])
-    return Candidate(module, make_input(layer, layout, dtype), depth)
+        depth = scene.depth.to(device, copy=True)
+    module = module.to(device=device, dtype=dtype, memory_format=LAYOUTS[layout])
+    return Candidate(module, make_input(layer, layout, dtype, device), depth)

@@ -102,6 +102,18 @@ GROUPED = _by_name(
     Layer("grouped", 1, 128, 60, 80, 128, groups=32),
 )
 
+#: Layers at the sizes and batches that a GPU trains on, one for each stage of a usual backbone.
+GPU = _by_name(
+    Layer("c64", 8, 64, 240, 320, 64),
+    Layer("c128", 8, 128, 120, 160, 128),
+    Layer("c256", 8, 256, 60, 80, 256),
+    Layer("c512", 8, 512, 30, 40, 512),
+)
+#: What quick runs keep of them.
+GPU_QUICK = ("c64", "c256")
+#: Frames in a batch of the paper's net.
+GPU_NET_BATCHES = (8, 1)
+
 #: The frame that the paper's net sees: (channels, height, width).
 NET_INPUT = (6, 240, 960)
 

@@ -35,6 +35,7 @@ def draw(folder: Path, rows: Sequence[Row], machine: dict[str, Any]) -> dict[str
     from matplotlib import pyplot
 
     import charts_bars
+    import charts_device
     import charts_invariance
     import charts_price
     import charts_scaling
@@ -51,6 +52,10 @@ def draw(folder: Path, rows: Sequence[Row], machine: dict[str, Any]) -> dict[str
         "memory": charts_bars.memory,
         "net": charts_bars.net,
         "invariance": charts_invariance.invariance_chart,
+        "gpu_layers": charts_device.layers,
+        "gpu_memory": charts_device.memory,
+        "gpu_net": charts_device.net,
+        "gpu_conv3d": charts_bars.peers,
     }
     names: dict[str, list[str]] = {}
     for suite, drawing in drawings.items():
@@ -66,7 +71,7 @@ def draw(folder: Path, rows: Sequence[Row], machine: dict[str, Any]) -> dict[str
 
 
 def _foot(machine: dict[str, Any]) -> str:
-    return (
-        f"{machine['cpu']}, {machine['surfconv_cpu_capability']}, torch {machine['torch']}, "
-        f"commit {machine['commit']}"
-    )
+    where = f"{machine['cpu']}, {machine['surfconv_cpu_capability']}"
+    if "gpu" in machine:
+        where = f"{machine['gpu']}, cuDNN {machine['cudnn']}, Triton {machine['triton']}"
+    return f"{where}, torch {machine['torch']}, commit {machine['commit']}"

@@ -20,7 +20,12 @@ HATCH = {"forward": "", "backward": "//", "forward + backward": "//"}
 def peers(rows: Sequence[Row]) -> Any:
     """How many times as long as SurfConv2d each peer takes."""
     rows = [row for row in rows if row.ratio is not None]
-    labels = [f"{row.subject}\n{row.case}, {row.direction}" for row in rows]
+    labels = [
+        ", ".join(
+            (f"{row.subject}\n{row.case}", row.direction, row.dtype)[: 2 + (row.dtype != "float32")]
+        )
+        for row in rows
+    ]
     figure, axes = pyplot.subplots(figsize=(10, 0.55 * len(rows) + 2.2))
     for place, row in enumerate(rows):
         assert row.ratio is not None
@@ -39,7 +44,9 @@ def peers(rows: Sequence[Row]) -> Any:
     axes.set_xlim(0.5, 3 * max(row.ratio or 1 for row in rows))
     axes.set_xlabel("time in times of SurfConv2d's (logarithmic; 1 = as fast as SurfConv2d)")
     axes.set_title("How much longer the alternatives take than SurfConv2d", fontsize=12)
-    handles: list[Any] = [Line2D([], [], label="target: the bar reaches this line", **TARGET)]
+    handles: list[Any] = []
+    if any(row.target is not None for row in rows):
+        handles.append(Line2D([], [], label="target: the bar reaches this line", **TARGET))
     handles += [
         Patch(facecolor=OTHER_COLOUR, edgecolor="white", hatch=HATCH[direction], label=direction)
         for direction in dict.fromkeys(row.direction for row in rows)

@@ -10,12 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from document import table
 from report import read_rows
 from rows import Row
+from tables import table
 
 #: Facts without which times of two runs say nothing about a change of the code.
-SAME_MACHINE = ("cpu", "cores", "torch", "torch_cpu_capability", "surfconv_cpu_capability")
+SAME_MACHINE = (
+    *("cpu", "cores", "torch", "torch_cpu_capability", "surfconv_cpu_capability"),
+    *("gpu", "driver", "cuda", "cudnn", "triton", "torchvision"),
+)
 SLOWER, FASTER, MORE, LESS, WITHIN = "SLOWER", "faster", "MORE", "less", ""
 
 

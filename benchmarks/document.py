@@ -2,30 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
+import document_device
 from cases import LAYOUTS
 from report import Report
 from rows import Row
 from suites.job import Suite
-
-MISSED = "**missed**"
-
-
-def table(
-    header: Sequence[str], rows: Iterable[Sequence[str]], numbers: Sequence[str]
-) -> list[str]:
-    """A Markdown table; the columns named in `numbers` are set to the right."""
-    rule = ["---:" if name in numbers else "---" for name in header]
-    return [
-        "| " + " | ".join(header) + " |",
-        "|" + "|".join(rule) + "|",
-        *("| " + " | ".join(cells) + " |" for cells in rows),
-    ]
-
-
-def _number(value: float) -> str:
-    return f"{value:.0f}" if value >= 1000 else f"{value:.3g}"
+from tables import MISSED, number, table
 
 
 def _verdict(row: Row) -> str:
@@ -43,7 +27,7 @@ def _target(row: Row) -> str:
     return "" if row.target is None else f"{row.target_sense} {row.target:g}"
 
 
-def _verdicts(rows: Sequence[Row], suites: Sequence[Suite]) -> list[str]:
+def _verdicts(rows: Sequence[Row], suites: Sequence[Suite], on_gpu: bool) -> list[str]:
     """How many targets each suite met, and every missed one, the worst first."""
     judged = [row for row in rows if row.verdict]
     if not judged:
@@ -56,12 +40,16 @@ def _verdicts(rows: Sequence[Row], suites: Sequence[Suite]) -> list[str]:
             counts.append((suite.title, str(len(own) - missed), str(missed)))
     lines = ["## Targets", ""]
     lines += table(("measured", "met", "missed"), counts, ("met", "missed"))
+    last = "threads"
+    if on_gpu:
+        last = "dtype"
+        lines += ["", "Target by target:", "", *document_device.by_target(judged)]
     lost = [row for row in judged if row.verdict == "missed"]
     lost.sort(key=_shortfall, reverse=True)
     if not lost:
         return [*lines, ""]
     lines += ["", "Every missed target, the worst first:", ""]
-    header = ("suite", "case", "what", "direction", "layout", "depth", "threads", "ratio", "target")
+    header = ("suite", "case", "what", "direction", "layout", "depth", last, "ratio", "target")
     cells = [
         (
             f"{row.suite}: {row.table}",
@@ -70,7 +58,7 @@ def _verdicts(rows: Sequence[Row], suites: Sequence[Suite]) -> list[str]:
             row.direction,
             row.layout,
             row.depth,
-            str(row.threads),
+            str(getattr(row, last)),
             _ratio(row),
             _target(row),
         )
@@ -112,7 +100,7 @@ def _distances(rows: Sequence[Row]) -> list[str]:
     lines: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         cells = lines.setdefault((row.case, row.subject), [])
-        cells.append(f"{_number(row.value)} ({_number(row.low)} .. {_number(row.high)})")
+        cells.append(f"{number(row.value)} ({number(row.low)} .. {number(row.high)})")
         if len(header) > 2 + len(distances):
             goal = "" if row.target is None else f" (≤ {row.target:g})"
             cells.append(_ratio(row).split(" (")[0] + goal)
@@ -120,7 +108,11 @@ def _distances(rows: Sequence[Row]) -> list[str]:
     return table(header, [(*place, *cells) for place, cells in lines.items()], header[2:])
 
 
-PIVOTS = {"prices": _prices, "distances": _distances}
+PIVOTS = {
+    "prices": _prices,
+    "distances": _distances,
+    "device": document_device.side_by_side,
+}
 
 
 def _details(rows: Sequence[Row], per_pixel: bool) -> list[str]:
@@ -135,14 +127,14 @@ def _details(rows: Sequence[Row], per_pixel: bool) -> list[str]:
         "depth": [row.depth for row in rows],
         "dtype": [row.dtype for row in rows],
         "threads": [str(row.threads) for row in rows],
-        unit if single else f"median {unit}": [_number(row.value) for row in rows],
-        "quartiles": [f"{_number(row.low)} .. {_number(row.high)}" for row in rows],
+        unit if single else f"median {unit}": [number(row.value) for row in rows],
+        "quartiles": [f"{number(row.low)} .. {number(row.high)}" for row in rows],
         "calls" if unit == "ms" else "samples": [str(row.samples) for row in rows],
         "ns per pixel": [
-            _number(1e6 * row.value / row.pixels) if row.pixels else "" for row in rows
+            number(1e6 * row.value / row.pixels) if row.pixels else "" for row in rows
         ],
         "ns per 1000 multiplications": [
-            _number(1e9 * row.value / row.macs) if row.macs else "" for row in rows
+            number(1e9 * row.value / row.macs) if row.macs else "" for row in rows
         ],
         "against": [row.baseline for row in rows],
         "ratio (quartiles)": [_ratio(row) for row in rows],
@@ -216,7 +208,7 @@ def render(report: Report, charts: dict[str, list[str]]) -> str:
     ]
     lines += [line for suite in report.suites if suite.method for line in (suite.method, "")]
     lines += [f"Not measured: {name}, because {why}" for name, why in report.unavailable.items()]
-    lines += ["", *_verdicts(report.rows, report.suites)]
+    lines += ["", *_verdicts(report.rows, report.suites, "gpu" in report.machine)]
     for suite in report.suites:
         own = [row for row in report.rows if row.suite == suite.name]
         if own:

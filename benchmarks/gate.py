@@ -98,10 +98,13 @@ class Operands:
         return at_points(self.layer, points, *self.leaves, self.guide, self.tolerance)
 
 
-def _operands(layer: Layer, subject: str, scene: Scene) -> Operands:
-    module = make_candidate(subject, layer, "contiguous", scene).module
+def make_operands(
+    layer: Layer, subject: str, scene: Scene, device: torch.device | str = "cpu"
+) -> Operands:
+    """The operands of SurfConv2d in one of its modes, in float32."""
+    module = make_candidate(subject, layer, "contiguous", scene, device=device).module
     assert isinstance(module, SurfConv2d) and module.bias is not None
-    depth, levels = scene.depth, module.levels
+    depth, levels = scene.depth.to(device), module.levels
     centres = at_output_centers(depth, layer.kernel, layer.stride, layer.padding)
     scale = depth_to_scale(centres, scene.reference_depth, levels=levels)
     guide, tolerance = None, 0.0
@@ -112,7 +115,7 @@ def _operands(layer: Layer, subject: str, scene: Scene) -> Operands:
         guide, tolerance = depth.clone(), scene.window
     if guide is not None:
         guide[~(depth > 0)] = float("nan")
-    leaves = (make_input(layer, "contiguous"), module.weight, module.bias, scale)
+    leaves = (make_input(layer, "contiguous", device=device), module.weight, module.bias, scale)
     return Operands(layer, leaves, guide, tolerance)
 
 
@@ -122,7 +125,7 @@ def against_relation(layer: Layer, subject: str, scene: Scene) -> list[Check]:
     The relation in float64 settles chosen output pixels and all gradients that flow from them. The
     operator's own float64, held to the same relation, settles the dense output and gradients.
     """
-    operands = _operands(layer, subject, scene)
+    operands = make_operands(layer, subject, scene)
     points = choose_points(layer)
     image, row, column = points.unbind(1)
     exact = operands.cast(torch.float64)
@@ -134,13 +137,13 @@ def against_relation(layer: Layer, subject: str, scene: Scene) -> list[Check]:
     dense_grads = torch.autograd.grad(dense_output, exact.leaves, dense)
     smooth = off_kinks(layer, exact.leaves[3].detach(), KINK)
     shown = f"{layer}, {subject}, {scene.kind} depth"
-    checks = [Check(f"{shown}, float64: output", relative_rms(_pick(dense_output, points), wanted))]
+    checks = [Check(f"{shown}, float64: output", relative_rms(pick(dense_output, points), wanted))]
     for layout, memory_format in LAYOUTS.items():
         own = operands.cast(torch.float32, layout)
         output = own.output()
         here = f"{shown}, {layout}"
         checks += [
-            Check(f"{here}: output at points", relative_rms(_pick(output, points), wanted)),
+            Check(f"{here}: output at points", relative_rms(pick(output, points), wanted)),
             Check(f"{here}: output", relative_rms(output, dense_output)),
         ]
         scattered = torch.zeros_like(output)
@@ -158,19 +161,21 @@ def against_relation(layer: Layer, subject: str, scene: Scene) -> list[Check]:
     return checks
 
 
-def _pick(output: Tensor, points: Tensor) -> Tensor:
+def pick(output: Tensor, points: Tensor) -> Tensor:
     image, row, column = points.unbind(1)
     return output[image, :, row, column]
 
 
-def at_scale_one(layer: Layer) -> list[Check]:
+def at_scale_one(
+    layer: Layer, device: torch.device | str = "cpu", allowed: float = TOLERANCE
+) -> list[Check]:
     """At scale 1 the operator is F.conv2d, output and gradients."""
-    candidate = make_candidate(BASELINE, layer, "contiguous")
+    candidate = make_candidate(BASELINE, layer, "contiguous", device=device)
     leaves = [leaf.detach().requires_grad_() for leaf in candidate.leaves()]
     # conv2d's float32 gradients of weight and bias are themselves off by half the tolerance.
     exact = [leaf.detach().double().requires_grad_() for leaf in leaves]
     options = {"stride": layer.stride, "padding": layer.padding, "groups": layer.groups}
-    scale = torch.ones(layer.batch, *layer.output_size)
+    scale = torch.ones(layer.batch, *layer.output_size, device=device)
     results = []
     for inputs, output in (
         (exact, conv2d(*exact, **options)),
@@ -179,7 +184,7 @@ def at_scale_one(layer: Layer) -> list[Check]:
         gradient = random_like(output.float()).to(output.dtype)
         results.append((output, *torch.autograd.grad(output, inputs, gradient)))
     return [
-        Check(f"{layer}: at scale 1 conv2d's {what}", relative_rms(got, want))
+        Check(f"{layer}: at scale 1 conv2d's {what}", relative_rms(got, want), allowed)
         for what, want, got in zip(
             ("output", *(f"gradient of {part}" for part in PARTS[:3])), *results, strict=True
         )
@@ -219,17 +224,17 @@ def half_types(layer: Layer, scene: Scene) -> list[Check]:
     return checks
 
 
-def peers_agree(layer: Layer, scene: Scene) -> list[Check]:
+def peers_agree(layer: Layer, scene: Scene, device: torch.device | str = "cpu") -> list[Check]:
     """The peers compute what SurfConv2d computes, so that their times can be compared."""
-    ours = make_candidate(CONTINUOUS, layer, "contiguous", scene)
+    ours = make_candidate(CONTINUOUS, layer, "contiguous", scene, device=device)
     expected = ours.forward()
     peers: list[type[DepthConv2d]] = [GridSampleConv2d]
-    if DEFORM not in unavailable():
+    if DEFORM not in unavailable(torch.device(device).type):
         peers.append(DeformConv2d)
     checks = []
     for peer in peers:
-        module = make_conv(layer, peer, reference_depth=scene.reference_depth)
-        error = relative_rms(module(ours.input, scene.depth), expected)
+        module = make_conv(layer, peer, reference_depth=scene.reference_depth).to(device)
+        error = relative_rms(module(ours.input, ours.depth), expected)
         checks.append(Check(f"{layer}: {peer.__name__} agrees", error, PEER_TOLERANCE))
     return checks
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import platform
 import subprocess
@@ -49,6 +50,45 @@ def load() -> float | None:
         return round(os.getloadavg()[0], 2)
     except (OSError, AttributeError):
         return None
+
+
+def _version(package: str) -> str:
+    """A package's version, or why it cannot be imported."""
+    try:
+        return str(importlib.import_module(package).__version__)
+    except (ImportError, OSError, RuntimeError) as error:
+        return f"none ({type(error).__name__}: {error})"
+
+
+def _driver() -> str:
+    try:
+        done = subprocess.run(
+            ["nvidia-smi", "--query-gpu=driver_version", "--format=csv,noheader"],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=20,
+        )
+        return done.stdout.split()[0]
+    except (OSError, IndexError, subprocess.SubprocessError):
+        return "unknown"
+
+
+def gpu(device: torch.device) -> dict[str, Any]:
+    """A CUDA device, and the software between it and torch."""
+    about = torch.cuda.get_device_properties(device)
+    return {
+        "gpu": about.name,
+        "gpu_compute_capability": f"{about.major}.{about.minor}",
+        "gpu_multiprocessors": about.multi_processor_count,
+        "gpu_memory_mib": about.total_memory // 2**20,
+        "gpu_l2_mib": about.L2_cache_size / 2**20,
+        "driver": _driver(),
+        "cuda": torch.version.cuda,
+        "cudnn": torch.backends.cudnn.version(),
+        "triton": _version("triton"),
+        "torchvision": _version("torchvision"),
+    }
 
 
 def describe(threads: tuple[int, ...]) -> dict[str, Any]:

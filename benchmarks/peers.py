@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import torch
@@ -14,29 +14,45 @@ from surfconv_ops import at_output_centers, depth_to_scale, reference
 GRID_SAMPLE = "grid_sample + einsum"
 PYRAMID = "4-level pyramid"
 DEFORM = "deform_conv2d"
+DEFORM_ALONE = "deform_conv2d, offsets given"
 CONV3D = "nn.Conv3d"
 REFERENCE = "surfconv_ops.reference"
 
 
-@lru_cache(maxsize=1)
-def deform_conv2d() -> tuple[Any, str]:
-    """torchvision's function, or None and why it cannot be used."""
+def _try_deform_conv2d(function: Any, device: str, dtype: torch.dtype) -> None:
+    image, offset, weight = (
+        torch.zeros(1, channels, 3, 3, device=device, dtype=dtype) for channels in (1, 18, 1)
+    )
+    function(image, offset, weight, padding=1)
+
+
+@cache
+def deform_conv2d(device: str = "cpu") -> tuple[Any, str]:
+    """torchvision's function, or None and why it cannot be used on a type of device."""
     try:
         from torchvision.ops import deform_conv2d as function
 
         # The import alone also succeeds where its compiled operators are missing.
-        function(
-            torch.zeros(1, 1, 3, 3), torch.zeros(1, 18, 3, 3), torch.zeros(1, 1, 3, 3), padding=1
-        )
+        _try_deform_conv2d(function, device, torch.float32)
     except (ImportError, RuntimeError, OSError, AttributeError) as error:
         reason = (str(error).strip().splitlines() or [""])[0]
         return None, f"torchvision cannot be used: {type(error).__name__}: {reason}"
     return function, ""
 
 
-def unavailable() -> dict[str, str]:
-    """Peers that cannot be measured here, and why."""
-    function, reason = deform_conv2d()
+@cache
+def deform_dtype(device: str, dtype: torch.dtype) -> torch.dtype:
+    """What deform_conv2d computes in: float32, as under autocast, where it lacks the dtype."""
+    try:
+        _try_deform_conv2d(deform_conv2d(device)[0], device, dtype)
+    except RuntimeError:
+        return torch.float32
+    return dtype
+
+
+def unavailable(device: str = "cpu") -> dict[str, str]:
+    """Peers that cannot be measured on a type of device, and why."""
+    function, reason = deform_conv2d(device)
     return {} if function is not None else {DEFORM: reason}
 
 
@@ -57,7 +73,10 @@ class DepthConv2d(nn.Conv2d):
 
     def taps(self) -> tuple[Tensor, Tensor]:
         """Row and column offsets of all taps from the centre, (K, 1, 1) each."""
-        y, x = (torch.arange(size) - (size - 1) / 2 for size in self.kernel_size)
+        y, x = (
+            torch.arange(size, device=self.weight.device) - (size - 1) / 2
+            for size in self.kernel_size
+        )
         tap_y, tap_x = torch.meshgrid(y, x, indexing="ij")
         return tap_y.reshape(-1, 1, 1), tap_x.reshape(-1, 1, 1)
 
@@ -96,23 +115,38 @@ class GridSampleConv2d(DepthConv2d):
 
     def _centres(self, axis: int, count: int) -> Tensor:
         first = (self.kernel_size[axis] - 1) / 2 - int(self.padding[axis])
-        return torch.arange(count) * self.stride[axis] + first
+        return torch.arange(count, device=self.weight.device) * self.stride[axis] + first
 
 
 class DeformConv2d(DepthConv2d):
     """torchvision's deformable convolution with offsets made from depth."""
 
     def forward(self, input: Tensor, depth: Tensor) -> Tensor:
+        return self.deform(input, self.offset(depth))
+
+    def offset(self, depth: Tensor) -> Tensor:
+        """(y, x) of tap 0, (y, x) of tap 1, ... as the second dimension of (N, 2K, Ho, Wo)."""
         stretch = self.scale(depth).unsqueeze(1) - 1
         tap_y, tap_x = self.taps()
-        # Its offsets come as (y, x) of tap 0, (y, x) of tap 1, ...
-        offset = torch.stack((stretch * tap_y, stretch * tap_x), 2).flatten(1, 2)
-        output: Tensor = deform_conv2d()[0](
-            input,
-            offset.to(input.dtype),
-            self.weight,
-            self.bias,
+        return torch.stack((stretch * tap_y, stretch * tap_x), 2).flatten(1, 2)
+
+    def deform(self, input: Tensor, offset: Tensor) -> Tensor:
+        """torchvision's function at given offsets."""
+        device = input.device.type
+        dtype = deform_dtype(device, input.dtype)
+        output: Tensor = deform_conv2d(device)[0](
+            input.to(dtype),
+            offset.to(dtype),
+            self.weight.to(dtype),
+            None if self.bias is None else self.bias.to(dtype),
             stride=self.stride,
             padding=self.padding,
         )
-        return output
+        return output.to(input.dtype)
+
+
+class OffsetConv2d(DeformConv2d):
+    """The same, its second input being the offsets: what torchvision's function alone takes."""
+
+    def forward(self, input: Tensor, offset: Tensor) -> Tensor:
+        return self.deform(input, offset)

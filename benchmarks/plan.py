@@ -39,6 +39,28 @@ QUICK_SECONDS = {
     "net": 4.0,
     "invariance": 2.0,
 }
+#: With --device cuda: adds up to about 6 minutes, kernels compiled on the way not counted.
+DEVICE_FULL_SECONDS = {
+    "gate": 60.0,
+    "gpu_layers": 120.0,
+    "gpu_memory": 25.0,
+    "gpu_net": 30.0,
+    "gpu_conv3d": 15.0,
+    "gpu_first": 90.0,
+}
+#: Adds up to about a minute.
+DEVICE_QUICK_SECONDS = {
+    "gate": 10.0,
+    "gpu_layers": 16.0,
+    "gpu_memory": 3.0,
+    "gpu_net": 5.0,
+    "gpu_conv3d": 2.0,
+    "gpu_first": 25.0,
+}
+SECONDS = {
+    "cpu": (FULL_SECONDS, QUICK_SECONDS),
+    "cuda": (DEVICE_FULL_SECONDS, DEVICE_QUICK_SECONDS),
+}
 
 
 @dataclass(frozen=True)
@@ -75,8 +97,11 @@ class Plan:
         return sum(self.seconds.values())
 
 
-def make_plan(quick: bool, threads: tuple[int, ...], suites: tuple[str, ...]) -> Plan:
-    """The plan of a full or a quick run over some of the suites."""
-    table = QUICK_SECONDS if quick else FULL_SECONDS
+def make_plan(
+    quick: bool, threads: tuple[int, ...], suites: tuple[str, ...], device: str = "cpu"
+) -> Plan:
+    """The plan of a full or a quick run over some of the suites of a kind of device."""
+    table = SECONDS[device][quick]
     seconds = {name: table[name] for name in ("gate", *suites)}
-    return Plan(quick, threads, seconds, minimum=2 if quick else 4, maximum=60)
+    minimum, maximum = (2 if quick else 4, 60) if device == "cpu" else (5 if quick else 10, 200)
+    return Plan(quick, threads, seconds, minimum, maximum)

@@ -27,9 +27,13 @@ def choose_points(layer: Layer) -> Tensor:
     return torch.stack((row // rows, row % rows, flat % columns), 1)
 
 
+def _taps(kernel: int, device: torch.device) -> Tensor:
+    return torch.arange(kernel, device=device) - (kernel - 1) / 2
+
+
 def _axis(centre: Tensor, scale: Tensor, kernel: int, size: int) -> list[tuple[Tensor, ...]]:
     """The two pixels around each tap's position along an axis: (index, weight, inside), (P, k)."""
-    position = centre[:, None] + scale[:, None] * (torch.arange(kernel) - (kernel - 1) / 2)
+    position = centre[:, None] + scale[:, None] * _taps(kernel, centre.device)
     low = position.detach().floor()
     share = position - low
     pixels = ((low, 1 - share), (low + 1, share))
@@ -88,6 +92,6 @@ def at_points(
 
 def off_kinks(layer: Layer, scale: Tensor, margin: float) -> Tensor:
     """Where no tap lies within `margin` of a pixel, so that all precisions agree on the slope."""
-    taps = torch.arange(1, (layer.kernel - 1) // 2 + 1)
+    taps = torch.arange(1, (layer.kernel - 1) // 2 + 1, device=scale.device)
     position = scale[..., None] * taps
     return ((position - position.round()).abs() > margin).all(-1)

@@ -19,8 +19,8 @@ COLUMNS = {
     "layout": "memory format of input and weight",
     "depth": "depth map: frames named kitti and indoor are real, random is a scale in 0.3 .. 6; "
     "in the invariance suite the distance, in times of the nearest view's",
-    "dtype": "dtype of input and weight",
-    "threads": "torch.set_num_threads",
+    "dtype": "dtype of input and weight; tf32 is float32 whose products may be taken in tf32",
+    "threads": "torch.set_num_threads; 0 where a GPU did the work",
     "unit": "unit of value, low and high; spreads are standard deviations of the features over the "
     "surface in the nearest view",
     "value": "median, or the only value",

@@ -4,6 +4,7 @@
     python benchmarks/run.py --quick                  under 1 minute, rough
     python benchmarks/run.py --suites layers net      some of it
     python benchmarks/run.py --compare old.json       and what changed since
+    python benchmarks/run.py --device cuda            on a GPU, suites of its own: about 6 minutes
 
 First a gate checks correctness at the timed shapes; if it fails, nothing is timed and the exit
 status is 1. Writes results.json, results.csv, results.md and charts.
@@ -15,22 +16,27 @@ import argparse
 import os
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
+import torch
+
 import charts
 import compare
+import devices
 import document
+import gate_device
 import machine
 import peers
+from devices import Device
 from gate import Check, gate
 from plan import Limits, Plan, make_plan
 from report import Report, read_rows, write_data
 from rows import Row
-from suites import SUITES
-from suites.job import Job
+from suites import DEVICE_SUITES, SUITES, device_suites
+from suites.job import Job, Suite
 from surfconv_ops.cli.common import count
 from timing import thread_count
 
@@ -78,59 +84,87 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     cores = os.cpu_count() or 1
     add("--threads", type=count, nargs="+", metavar="N",
         default=list(range(1, min(cores, DEFAULT_THREADS) + 1)),
-        help="thread counts; single runs use the first (default: %(default)s)")  # fmt: skip
-    add("--suites", nargs="+", choices=list(SUITES), default=list(SUITES), metavar="NAME",
-        help=f"what to measure: {', '.join(SUITES)} (default: all)")  # fmt: skip
+        help="CPU thread counts; single runs use the first (default: %(default)s)")  # fmt: skip
+    add("--device", choices=["cpu", "cuda"], default="cpu",
+        help="where to measure; cuda is the current GPU (default: %(default)s)")  # fmt: skip
+    add("--suites", nargs="+", choices=[*SUITES, *DEVICE_SUITES], metavar="NAME",
+        help=f"what to measure: {', '.join(SUITES)}; with --device cuda: "
+        f"{', '.join(DEVICE_SUITES)} (default: all of the device's)")  # fmt: skip
     add("--compare", type=Path, metavar="FILE", help="an earlier results.json; writes compare.md")
     add("--no-charts", action="store_true", help="write no PNG files")
-    return parser.parse_args(arguments)
+    chosen = parser.parse_args(arguments)
+    own = SUITES if chosen.device == "cpu" else DEVICE_SUITES
+    chosen.suites = list(own) if chosen.suites is None else chosen.suites
+    wrong = [name for name in chosen.suites if name not in own]
+    if wrong:
+        parser.error(
+            f"--suites: {', '.join(wrong)} is not measured with --device {chosen.device}, which "
+            f"has {', '.join(own)}"
+        )
+    return chosen
 
 
-def check(plan: Plan, bar: Bar) -> list[Check]:
+def check(
+    plan: Plan, jobs: Sequence[tuple[str, Callable[[], list[Check]]]], bar: Bar
+) -> list[Check]:
     """Run the gate to its end, red or not."""
     checks: list[Check] = []
     with thread_count(max(plan.threads)):
-        for label, function in gate(plan):
+        for label, function in jobs:
             bar.set_description(f"gate: {label}")
             checks += function()
             bar.update()
     return checks
 
 
-def measure(plan: Plan, name: str, jobs: Sequence[Job], bar: Bar) -> list[Row]:
-    """Run a suite's jobs, each with its share of the suite's seconds."""
+def measure(
+    plan: Plan, name: str, jobs: Sequence[Job], bar: Bar, unavailable: dict[str, str]
+) -> list[Row]:
+    """Run a suite's jobs, each with its share of the suite's seconds.
+
+    A job for which the device has too little memory is entered in `unavailable` instead.
+    """
     rows: list[Row] = []
     total = sum(job.work for job in jobs)
     for job in jobs:
         bar.set_description(f"{name}: {job.label}")
         share = max(LEAST_SECONDS, plan.seconds[name] * job.work / total)
-        rows += job.measure(Limits(share, plan.minimum, plan.maximum))
+        try:
+            rows += job.measure(Limits(share, plan.minimum, plan.maximum))
+        except torch.OutOfMemoryError:
+            unavailable[f"{name} {job.label}"] = "the device has too little memory"
         bar.update()
     return rows
 
 
-def run(plan: Plan) -> Report:
+def run(plan: Plan, device: Device | None = None) -> Report:
     """Gate, then the plan's suites.
 
     Args:
         plan: what and how long.
+        device: where the device suites run; None for the processor's own suites.
 
     Returns:
         The report; without rows where the gate is red.
     """
-    names = [name for name in SUITES if name in plan.seconds]
+    suites: dict[str, Suite] = SUITES if device is None else device_suites(device)
+    names = [name for name in suites if name in plan.seconds]
     about = machine.describe(plan.threads)
-    jobs = {name: SUITES[name].jobs(plan) for name in names}
-    with _bar(len(gate(plan)) + sum(map(len, jobs.values()))) as bar:
+    if device is not None:
+        about |= device.facts()
+    jobs = {name: suites[name].jobs(plan) for name in names}
+    checks = gate(plan) if device is None else gate_device.gate(plan, device)
+    with _bar(len(checks) + sum(map(len, jobs.values()))) as bar:
         start = time.perf_counter()
-        report = Report(about, plan, check(plan, bar), [SUITES[name] for name in names])
+        report = Report(about, plan, check(plan, checks, bar), [suites[name] for name in names])
         report.elapsed["gate"] = time.perf_counter() - start
         if not report.green:
             return report
-        report.unavailable = peers.unavailable() if "peers" in names else {}
+        if {"peers", "gpu_layers"} & set(names):
+            report.unavailable = peers.unavailable("cpu" if device is None else device.where.type)
         for name in names:
             start = time.perf_counter()
-            report.rows += measure(plan, name, jobs[name], bar)
+            report.rows += measure(plan, name, jobs[name], bar, report.unavailable)
             report.elapsed[name] = time.perf_counter() - start
     about["load_after"] = machine.load()
     return report
@@ -165,8 +199,17 @@ def main(arguments: list[str] | None = None) -> int:
     except ValueError as error:
         print(f"--compare: {error}", file=sys.stderr)
         return 2
-    threads = tuple(dict.fromkeys(chosen.threads))
-    report = run(make_plan(chosen.quick, threads, tuple(chosen.suites)))
+    if chosen.device == "cpu":
+        threads = tuple(dict.fromkeys(chosen.threads))
+        report = run(make_plan(chosen.quick, threads, tuple(chosen.suites)))
+    else:
+        why = devices.missing()
+        if why:
+            print(f"--device cuda: {why}", file=sys.stderr)
+            return 2
+        threads = (torch.get_num_threads(),)
+        plan = make_plan(chosen.quick, threads, tuple(chosen.suites), chosen.device)
+        report = run(plan, devices.Cuda())
     paths = write(chosen.out, report, not chosen.no_charts)
     if not report.green:
         for failed in (check for check in report.checks if not check.passed):

@@ -64,6 +64,16 @@ NET = Target(1.6)
 MEMORY = Target(1.10)
 HALF_TYPES = Target(1.5)
 
+#: On one H100, in these numerics alone: by direction, the most in times of nn.Conv2d's time, how
+#: many times as long deform_conv2d has to take, and the most in times of nn.Conv2d's peak memory.
+GPU_NUMERICS = ("tf32", "bfloat16")
+GPU_PRICES = {"forward": Target(1.6), "forward + backward": Target(2.0)}
+GPU_LEADS = {
+    "forward": Target(3.0, at_least=True),
+    "forward + backward": Target(4.0, at_least=True),
+}
+GPU_MEMORY = Target(1.15)
+
 #: Most that features may change with distance in continuous mode, in times of nn.Conv2d's change,
 #: on a wall whose texture's wavelength is at least so many tap spacings.
 INVARIANCE = Target(0.25)

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import torch
 
@@ -26,9 +27,15 @@ def quartiles(values: list[float]) -> tuple[float, float]:
 
 @dataclass
 class Timing:
-    """Seconds of each timed call, in the order of the rounds it took part in."""
+    """Seconds of each timed call, in the order of the rounds it took part in.
+
+    Attributes:
+        seconds: what the calls took.
+        host: how long each kept the processor, which a call that a GPU works on does not wait for.
+    """
 
     seconds: list[float] = field(default_factory=list)
+    host: list[float] = field(default_factory=list)
 
     @property
     def median(self) -> float:
@@ -58,10 +65,29 @@ class Call:
     prepare: Callable[[], object] = lambda: None
 
 
+class Clock(Protocol):
+    """How long a call takes."""
+
+    def time(self, run: Callable[[], object]) -> tuple[float, float]:
+        """Seconds of the call, and seconds that it kept the processor."""
+        ...
+
+
+class HostClock:
+    """A clock for calls that are over when they return."""
+
+    def time(self, run: Callable[[], object]) -> tuple[float, float]:
+        start = time.perf_counter()
+        run()
+        seconds = time.perf_counter() - start
+        return seconds, seconds
+
+
 def interleave(
     calls: Mapping[str, Call | Callable[[], object]],
     limits: Limits,
     started: float | None = None,
+    clock: Clock | None = None,
 ) -> dict[str, Timing]:
     """Time every call once a round, after one untimed call each.
 
@@ -74,11 +100,13 @@ def interleave(
         limits: rounds and seconds.
         started: `time.perf_counter()` when the job began, so that what it took to set it up counts
             as well; None: now.
+        clock: what times a call; None: a `HostClock`.
 
     Returns:
         The timings by name; the slow ones have fewer.
     """
     begin = time.perf_counter() if started is None else started
+    clock = HostClock() if clock is None else clock
     ready = {name: call if isinstance(call, Call) else Call(call) for name, call in calls.items()}
     results = {name: Timing() for name in ready}
     share = LARGEST_SHARE * limits.seconds / len(ready)
@@ -89,11 +117,11 @@ def interleave(
         if number >= limits.minimum and time.perf_counter() - begin > limits.seconds:
             break
         for name, call in ready.items():
-            seconds = results[name].seconds
-            if number >= limits.minimum and sum(seconds) > share:
+            result = results[name]
+            if number >= limits.minimum and sum(result.seconds) > share:
                 continue
             call.prepare()
-            start = time.perf_counter()
-            call.run()
-            seconds.append(time.perf_counter() - start)
+            seconds, host = clock.time(call.run)
+            result.seconds.append(seconds)
+            result.host.append(host)
     return results

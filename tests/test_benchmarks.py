@@ -33,8 +33,9 @@ from timing import Timing, interleave
 ONCE = Limits(seconds=0.0, minimum=1, maximum=1)
 
 
-#: Where frames 16 times smaller would leave a net, or two sizes, too small to tell apart.
-SHRINK = {"net": 4, "scaling": 4}
+#: Where frames 16 times smaller would leave a net, or two sizes, too small to tell apart, or an
+#: output that fits into pages that the process already has.
+SHRINK = {"net": 4, "scaling": 4, "memory": 4}
 
 
 def tiny_plan(*suites: str, quick: bool = False, threads: tuple[int, ...] = (1,)) -> Plan:

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from devices import Device
 from suites import (
     channels,
     conv3d,
     dtypes,
+    gpu_conv3d,
+    gpu_first,
+    gpu_layers,
+    gpu_memory,
+    gpu_net,
     grouped,
     invariance,
     layers,
@@ -33,3 +39,12 @@ SUITES: dict[str, Suite] = {
         invariance,
     )
 }
+
+_ON_DEVICE = (gpu_layers, gpu_memory, gpu_net, gpu_conv3d, gpu_first)
+#: Names of what --device cuda measures.
+DEVICE_SUITES = tuple(module.NAME for module in _ON_DEVICE)
+
+
+def device_suites(device: Device) -> dict[str, Suite]:
+    """The suites that run on a device."""
+    return {module.NAME: module.suite(device) for module in _ON_DEVICE}

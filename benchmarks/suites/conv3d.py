@@ -42,11 +42,11 @@ def jobs(plan: Plan) -> list[Job]:
     return [job("forward")] if plan.quick else [job("forward"), job("backward")]
 
 
-def _pair(divisor: int, plan: Plan) -> tuple[Candidate, Candidate, str]:
+def make_pair(divisor: int, shrink: int) -> tuple[Candidate, Candidate, str]:
     """SurfConv2d and nn.Conv3d, both three voxels wide, and the kind of depth."""
     kind = "indoor" if "indoor" in smooth_kinds() else SYNTHETIC
-    height, width = (side // plan.shrink for side in FRAME)
-    focal = FOCAL_LENGTHS[kind] / plan.shrink
+    height, width = (side // shrink for side in FRAME)
+    focal = FOCAL_LENGTHS[kind] / shrink
     depth = make_scene(kind, 1, height, width).depth
     channels = cases.VOXEL_CHANNELS
     features = torch.randn(1, channels, height, width, generator=torch.Generator().manual_seed(2))
@@ -77,7 +77,7 @@ def _measure(direction: str, divisor: int, plan: Plan, limits: Limits) -> list[R
     started = time.perf_counter()
     threads = max(plan.threads)
     with thread_count(threads):
-        ours, theirs, kind = _pair(divisor, plan)
+        ours, theirs, kind = make_pair(divisor, plan.shrink)
         calls = {OURS: ours.call(direction), CONV3D: theirs.call(direction)}
         few = replace(limits, minimum=min(ROUNDS, limits.minimum), maximum=2 * ROUNDS)
         timings = interleave(calls, few, started)

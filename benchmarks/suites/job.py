@@ -39,7 +39,7 @@ class Suite:
         about: what the numbers mean, for a reader of the report.
         jobs: the jobs of a plan.
         pivot: what the report shows side by side: "" (one line a row), "prices" (layouts and
-            directions) or "distances".
+            directions), "distances" or "device" (everything on a layer beside nn.Conv2d).
         method: a sentence for the head of the report, where nothing is timed.
     """
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import torch
 from torch import nn
 
 import peers
@@ -41,8 +42,15 @@ ROUNDS = 3
 WORK = 60
 
 
-def make_peer(name: str, layer: Layer, scene: Scene) -> Candidate:
-    """One of `COUNTERPARTS` with the weights and inputs that SurfConv2d has."""
+def make_peer(
+    name: str,
+    layer: Layer,
+    scene: Scene,
+    layout: str = LAYOUT,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str = "cpu",
+) -> Candidate:
+    """One of the peers with the weights and inputs that SurfConv2d has."""
 
     def pyramid() -> nn.Module:
         return SurfConvPyramid(make_conv(layer), scene.levels, scene.reference_depth)
@@ -53,11 +61,13 @@ def make_peer(name: str, layer: Layer, scene: Scene) -> Candidate:
     make: dict[str, Callable[[], nn.Module]] = {
         peers.GRID_SAMPLE: of(peers.GridSampleConv2d),
         peers.DEFORM: of(peers.DeformConv2d),
+        peers.DEFORM_ALONE: of(peers.OffsetConv2d),
         peers.REFERENCE: of(peers.ReferenceConv2d),
         peers.PYRAMID: pyramid,
     }
-    module = make[name]().to(memory_format=LAYOUTS[LAYOUT])
-    return Candidate(module, make_input(layer, LAYOUT), scene.depth.clone())
+    module = make[name]().to(device=device, dtype=dtype, memory_format=LAYOUTS[layout])
+    input = make_input(layer, layout, dtype, device)
+    return Candidate(module, input, scene.depth.to(device, copy=True))
 
 
 def jobs(plan: Plan) -> list[Job]:
