@@ -183,6 +183,14 @@ def test_far_taps() -> None:
     problem.check_gradients(operator)
 
 
+def test_taps_beyond_32_bits() -> None:
+    far = 2**30
+    problem = make_problem(1, 1, 2, (3, 3), dilation=far, padding=far, dtype=torch.float64)
+    problem.scale.mul_(1 / far)
+    problem.check_forward(operator)
+    problem.check_gradients(operator)
+
+
 def test_scale_one_hides_what_conv2d_does_not_see() -> None:
     problem = make_problem(scale="ones")
     problem.input[0, 0, 2, 3] = torch.inf

@@ -82,8 +82,10 @@ def rise_of_samples(image, pixels, samples, channel, exists):
             along_y += (weight_x * (2 * i - 1))[:, None] * value
             along_x += (weight_y * (2 * j - 1))[:, None] * value
     # Where a tap does not move, 0 * inf must not appear.
-    along_y = tl.where(samples.doubled_y == 0, 0.0, along_y * (0.5 * samples.doubled_y))
-    along_x = tl.where(samples.doubled_x == 0, 0.0, along_x * (0.5 * samples.doubled_x))
+    tap_y = samples.doubled_y.to(along_y.dtype) * 0.5
+    along_y = tl.where(tap_y == 0, 0.0, along_y * tap_y)
+    tap_x = samples.doubled_x.to(along_x.dtype) * 0.5
+    along_x = tl.where(tap_x == 0, 0.0, along_x * tap_x)
     return along_y, along_x
 
 

@@ -14,7 +14,7 @@ import triton.language as tl
 @triton.jit
 def tap_doubled(tap, KERNEL: tl.constexpr, DILATION: tl.constexpr):
     """Twice the distance of a tap from its centre at scale 1."""
-    return DILATION * (2 * tap - (KERNEL - 1))
+    return tl.cast(DILATION, tl.int64) * (2 * tap - (KERNEL - 1))
 
 
 @triton.jit
@@ -25,7 +25,7 @@ def locate(centre, scale, doubled, HALF: tl.constexpr, LIMIT: tl.constexpr):
     derivatives of all taps are the same one-sided derivative. A tap of zero offset stays on its
     centre, whatever the scale.
     """
-    offset = tl.where(doubled == 0, 0.0, HALF + scale * (0.5 * doubled))
+    offset = tl.where(doubled == 0, 0.0, HALF + scale * (doubled.to(scale.dtype) * 0.5))
     # NaN compares false; what is further away than any image reaches would not fit an integer.
     reached = tl.abs(offset) < LIMIT
     offset = tl.where(reached, offset, 0.0)

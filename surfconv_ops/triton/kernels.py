@@ -11,7 +11,7 @@ from ..layout import lay_out, memory_format_of
 from .accumulate import Sums
 from .backward_data import backward_data_kernel
 from .backward_weight import backward_weight_kernel
-from .conv import Conv, channels_innermost, limits_of_view
+from .conv import Conv, channels_innermost, limits_of_view, tensor_float32
 from .depth_to_scale import depth_to_scale, depth_to_scale_backward
 from .forward import forward_kernel
 from .interpreter import in_float32, needs_float32
@@ -71,7 +71,7 @@ def forward(
             )
 
         with on_device(input):
-            variant = (guide is not None, image.dtype)
+            variant = (guide is not None, tensor_float32())
             run(fastest("forward", conv, variant, forward_tiles(conv), run, input.device))
     return lay_out(output.permute(0, 3, 1, 2), memory_format_of(input))
 
@@ -170,7 +170,7 @@ def _backward_data(
         return partial
 
     if conv.pixels:
-        variant = (view[0] is not None, need_input, need_scale, sums is None or sums.words)
+        variant = (view[0] is not None, tensor_float32(), need_input, need_scale)
         tiles = fastest("backward_data", conv, variant, data_tiles(conv), run, image.device)
         scale_sums = run(tiles).sum(0)
     else:
@@ -222,6 +222,6 @@ def _backward_weight(conv: Conv, shared: _Shared) -> Tensor:
         )
         return partial
 
-    variant = view[0] is not None
+    variant = (view[0] is not None, tensor_float32())
     tiles = fastest("backward_weight", conv, variant, weight_tiles(conv), run, image.device)
     return run(tiles).sum(0).permute(3, 2, 0, 1)
