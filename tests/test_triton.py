@@ -17,7 +17,7 @@ pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton")
 from surfconv_ops import reference
 from surfconv_ops import triton as backend
 from surfconv_ops.layout import memory_format_of
-from surfconv_ops.triton import conv, kernels, tiles
+from surfconv_ops.triton import conv, gradients, kernels, tiles
 
 # The interpreter computes lanes that are masked.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -150,10 +150,26 @@ def test_every_tile(case: dict[str, Any], choice: str, monkeypatch: pytest.Monke
         chosen: tiles.Tiles = candidates[:2][-1] if choice == "second" else candidates[-1]
         return chosen
 
-    monkeypatch.setattr(kernels, "fastest", pick)
+    for module in (kernels, gradients):
+        monkeypatch.setattr(module, "fastest", pick)
     problem = make_problem(2, **({"size": (4, 5)} | case))
     problem.check_forward(operator)
     problem.check_gradients(operator)
+
+
+def test_passes_over_images(order: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sums of half types' gradients hold some of the images at a time."""
+    problem = make_problem(5, 2, 4, (4, 5), dtype=torch.float16, guide="holes", axes=2)
+    grad = torch.randn(problem.output_shape()).half()
+    whole = problem.gradients(operator, grad)
+    made = []
+    monkeypatch.setattr(gradients, "_SUM_BYTES", 2 * 2 * 4 * 5 * (8 if order != "arrival" else 4))
+    run_pass = gradients._pass
+    monkeypatch.setattr(gradients, "_pass", lambda c, *a: made.append(c.batch) or run_pass(c, *a))
+    for name, value in problem.gradients(operator, grad).items():
+        torch.testing.assert_close(value, whole[name], rtol=2e-3, atol=2e-3, msg=name)
+    assert made == [2, 2, 1]
+    problem.check_gradients(operator, grad)
 
 
 def test_wide_positions(monkeypatch: pytest.MonkeyPatch) -> None:
