@@ -61,12 +61,13 @@ def forward_tiles(conv: Conv) -> list[Tiles]:
 
 
 def data_tiles(conv: Conv) -> list[Tiles]:
-    """Ways to cut the gradients of input and scale."""
+    """Ways to cut the gradients of input and scale, which take many registers."""
     if conv.lanes:
-        return [Tiles(32, _block(conv.channels, 64), 1, 4, 2)]
-    inner, outer = _block(conv.group_channels, 64), _block(conv.group_out, 64)
-    first = Tiles(64, min(inner, 32), outer, 8, 3)
-    return list(dict.fromkeys([first, replace(first, channels_in=inner, stages=2)]))
+        first = Tiles(16, _block(conv.channels, 64), 1, 4, 2)
+        return list(dict.fromkeys([first, replace(first, channels_in=_block(conv.channels, 32))]))
+    inner, outer = _block(conv.group_channels, 32), _block(conv.group_out, 64)
+    first = Tiles(64, inner, outer, 8, 2)
+    return [first, replace(first, pixels=32, warps=4)]
 
 
 def weight_tiles(conv: Conv) -> list[Tiles]:
