@@ -109,7 +109,7 @@ def depth_to_scale(
     else:
         scales = [scale_of(depth.to(dtype), r, rule) for r in references]
     if min_scale > 0 or max_scale < math.inf:
-        _warn_of_clamping(references, depth, levels, rule)
+        _warn_of_clamping(references, depth, levels, rule, scales)
     return torch.stack(scales, -3) if isinstance(reference, tuple) else scales[0]
 
 
@@ -233,6 +233,7 @@ def _warn_of_clamping(
     depth: Tensor,
     levels: DepthLevels | None,
     limits: ScaleRule,
+    scales: list[Tensor],
 ) -> None:
     global _cuda_calls_checked, _warned_of_clamping
     if _warned_of_clamping or torch.compiler.is_compiling():
@@ -242,12 +243,18 @@ def _warn_of_clamping(
         if enough or torch.cuda.is_current_stream_capturing():
             return
         _cuda_calls_checked += 1
-    metres = depth.detach().to(torch.float64) if levels is None else levels.quantize(depth)
-    valid = valid_depth(metres)
-    clamped = [valid & ((r / metres < limits.low) | (r / metres > limits.high)) for r in references]
     try:
-        count = sum(int(c.sum()) for c in clamped)
-        total = len(references) * int(valid.sum())
+        # Only a scale at its limit can have been clamped: most calls need no closer look.
+        ends = [limits.low] if limits.low > 0 else []
+        ends += [limits.high] if limits.high < torch.finfo(scales[0].dtype).max else []
+        suspects = sum(int(torch.count_nonzero(s == end)) for s in scales for end in ends)
+        total = len(references) * int(torch.count_nonzero(valid_depth(depth))) if suspects else 0
+        if suspects <= CLAMPED_SHARE_TO_WARN * total:
+            return
+        metres = depth.detach().to(torch.float64) if levels is None else levels.quantize(depth)
+        wanted = [r / metres for r in references]
+        outside = [(w < limits.low) | (w > limits.high) for w in wanted]
+        count = sum(int((valid_depth(metres) & o).sum()) for o in outside)
     except RuntimeError:
         # Under vmap and in traces values cannot be read; an eager call will tell.
         return

@@ -190,6 +190,11 @@ def count(bad, **limits):
     return [str(w.message) for w in caught]
 assert count(10, min_scale=0.5) == [], "10 % is not more than 10 %"
 assert count(90) == [], "nothing clamps without limits"
+from surfconv_ops import depth as module
+for limits in ({"max_scale": 0.0}, {"max_scale": 0.9}, {"min_scale": 1.5, "max_scale": 2.0}):
+    module._warned_of_clamping = False
+    assert len(count(0, **limits)) == 1, limits
+module._warned_of_clamping = False
 first = count(11, min_scale=0.5)
 assert len(first) == 1 and "11%" in first[0].replace(" ", "") and "0.5" in first[0], first
 assert count(50, min_scale=0.5) == [], "said once"
