@@ -102,6 +102,13 @@ GROUPED = _by_name(
     Layer("grouped", 1, 128, 60, 80, 128, groups=32),
 )
 
+#: nn's pools and ours; the first word says which.
+POOLS = _by_name(
+    Layer("max", 1, 64, 120, 160, 64, stride=2, groups=64),
+    Layer("avg", 1, 64, 120, 160, 64, stride=2, groups=64),
+    Layer("max large", 1, 16, 480, 640, 16, stride=2, groups=16),
+)
+
 #: Layers at the sizes and batches that a GPU trains on, one for each stage of a usual backbone.
 GPU = _by_name(
     Layer("c64", 8, 64, 240, 320, 64),

@@ -44,6 +44,7 @@ def draw(folder: Path, rows: Sequence[Row], machine: dict[str, Any]) -> dict[str
         "layers": charts_price.layers,
         "channels": charts_price.channels,
         "grouped": charts_price.grouped,
+        "pools": charts_price.pools,
         "dtypes": charts_bars.dtypes,
         "levels": charts_scaling.levels,
         "peers": charts_bars.peers,

@@ -14,6 +14,8 @@ from rows import Row
 #: Colours that people with any colour vision can tell apart (Okabe and Ito).
 COLOURS = {
     "nn.Conv2d": "0.55",
+    "SurfMaxPool2d": "#0072B2",
+    "SurfAvgPool2d": "#E69F00",
     "SurfConv2d continuous": "#0072B2",
     "SurfConv2d 4 levels": "#E69F00",
     "SurfConv2d 8 levels": "#CC79A7",
@@ -70,7 +72,7 @@ def _panel(axes: Any, rows: Sequence[Row], cases: Sequence[str], marks: dict[str
     axes.set_axisbelow(True)
 
 
-def _prices(rows: Sequence[Row], title: str) -> Any:
+def _prices(rows: Sequence[Row], title: str, baseline: str = "nn.Conv2d") -> Any:
     """Panels by thread count (down) and direction and layout (across)."""
     rows = [row for row in rows if row.ratio is not None and row.depth and row.table != "guide"]
     threads = sorted({row.threads for row in rows})
@@ -103,7 +105,7 @@ def _prices(rows: Sequence[Row], title: str) -> Any:
             axes.set_title(f"{direction}, {layout}, {count} thread{plural}", fontsize=10)
         highest = max(max(row.ratio_high or 0, row.ratio or 0, row.target or 0) for row in shown)
         axes_line[0].set_ylim(0, 1.08 * max(1.2, highest))
-        axes_line[0].set_ylabel("time in times of nn.Conv2d")
+        axes_line[0].set_ylabel(f"time in times of {baseline}")
     subjects = dict.fromkeys(row.subject for row in rows)
     handles = [
         Line2D([], [], color=colour(subject), linewidth=5, label=subject) for subject in subjects
@@ -114,7 +116,7 @@ def _prices(rows: Sequence[Row], title: str) -> Any:
     ]
     if any(row.target is not None for row in rows):
         handles.append(Line2D([], [], label="target: at or below this line", **TARGET))
-    handles.append(Line2D([], [], color="0.6", linestyle=":", label="1 = the price of nn.Conv2d"))
+    handles.append(Line2D([], [], color="0.6", linestyle=":", label=f"1 = the price of {baseline}"))
     figure.suptitle(title, fontsize=12)
     figure.legend(handles=handles, loc="lower center", ncols=min(len(handles), 7), fontsize=9,
                   frameon=False, bbox_to_anchor=(0.5, 0.02))  # fmt: skip
@@ -139,3 +141,8 @@ def channels(rows: Sequence[Row]) -> Any:
 def grouped(rows: Sequence[Row]) -> Any:
     """Depthwise and grouped."""
     return _prices(rows, "What SurfConv2d costs on depthwise and grouped layers")
+
+
+def pools(rows: Sequence[Row]) -> Any:
+    """Pools."""
+    return _prices(rows, "What pools cost whose window follows depth", "nn's pool")

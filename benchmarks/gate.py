@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import avg_pool2d, conv2d, max_pool2d
 
 import cases
 from candidates import (
@@ -28,7 +28,7 @@ from frames import RANDOM, Scene, make_scene, smooth_kinds
 from peers import DEFORM, DeformConv2d, DepthConv2d, GridSampleConv2d, unavailable
 from plan import Plan
 from points import at_points, choose_points, off_kinks
-from surfconv_ops import SurfConv2d, at_output_centers, depth_to_scale, surf_conv2d
+from surfconv_ops import SurfConv2d, at_output_centers, depth_to_scale, pool_reference, surf_conv2d
 from timing import thread_count
 
 #: Relative RMS of float32 sums of up to H * W terms; a wrong tap is off by 1e-2 and more.
@@ -239,6 +239,43 @@ def peers_agree(layer: Layer, scene: Scene, device: torch.device | str = "cpu") 
     return checks
 
 
+def pool_agrees(layer: Layer, scene: Scene) -> list[Check]:
+    """A pool against its readable definition in float64, and at scale 1 against nn's."""
+    maximum = layer.name.startswith("max")
+    window = ((layer.kernel,) * 2, (layer.stride,) * 2, (layer.padding,) * 2)
+    options = (*window, (1, 1)) if maximum else (*window, True, 0)
+    ops, name = torch.ops.surfconv, "surf_max_pool2d" if maximum else "surf_avg_pool2d"
+    forward, backward = getattr(ops, name), getattr(ops, f"{name}_backward")
+    centres = at_output_centers(scene.depth, layer.kernel, layer.stride, layer.padding)
+    scale = depth_to_scale(centres, scene.reference_depth)[:, None]
+    smooth = off_kinks(layer, scale.double(), KINK)
+    checks = []
+    for layout in LAYOUTS:
+        here = f"{layer}, {layout}"
+        input = make_input(layer, layout)
+        output, *winner = forward(input, scale, None, 0.0, *options) if maximum else (
+            forward(input, scale, None, 0.0, *options),
+        )  # fmt: skip
+        exact = (input.double(), scale.double(), None)
+        truth = pool_reference.max_forward if maximum else pool_reference.avg_forward
+        wanted = truth(*exact, 0.0, *options)
+        wanted = wanted[0] if maximum else wanted
+        checks.append(Check(f"{here}: output", relative_rms(output, wanted)))
+        gradient = random_like(output)
+        grads = backward(gradient, input, scale, None, *winner, 0.0, *options, True, True)
+        derive = pool_reference.max_backward if maximum else pool_reference.avg_backward
+        wants = derive(gradient.double(), *exact, *winner, 0.0, *options, True, True)
+        checks.append(Check(f"{here}: gradient of input", relative_rms(grads[0], wants[0])))
+        error = relative_rms(grads[1][smooth], wants[1][smooth])
+        checks.append(Check(f"{here}: gradient of scale", error))
+        ones = torch.ones_like(scale)
+        unit = forward(input, ones, None, 0.0, *options)
+        plain = max_pool2d if maximum else avg_pool2d
+        error = relative_rms(unit[0] if maximum else unit, plain(input, *window))
+        checks.append(Check(f"{here}: at scale 1 nn's", error))
+    return checks
+
+
 def gate(plan: Plan) -> list[tuple[str, Callable[[], list[Check]]]]:
     """All checks of a plan, as (label, function) in the order in which they are to run."""
     smooth = smooth_kinds()[0]
@@ -261,6 +298,9 @@ def gate(plan: Plan) -> list[tuple[str, Callable[[], list[Check]]]]:
         add(layer, same_bits, scene_of(layer, make_scene, smooth), threads)
         for subject, kind in combinations if important else combinations[: 1 if plan.quick else 2]:
             add(layer, against_relation, subject, scene_of(layer, make_scene, kind))
+    pools = list(cases.POOLS.values())[: 2 if plan.quick else None]
+    for layer in (shape.shrunk(plan.shrink) for shape in pools):
+        add(layer, pool_agrees, scene_of(layer, make_scene, smooth))
     first = main[0].shrunk(plan.shrink)
     scene = scene_of(first, make_scene, smooth)
     add(first, half_types, scene)

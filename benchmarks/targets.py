@@ -44,6 +44,8 @@ def _flat(limit: float) -> Price:
 
 SMALL_CHANNELS = _flat(2.0)
 GROUPED = _flat(2.5)
+#: Our own limit: a pool samples as much for each output as a depthwise layer.
+POOLS = Target(2.5)
 MAIN = {
     "A": Price(1.12, 1.10, 1.10),
     "B": Price(1.18, 1.10, 1.10),

@@ -19,6 +19,7 @@ from suites import (
     memory,
     net,
     peers,
+    pools,
     scaling,
 )
 from suites.job import Suite
@@ -29,6 +30,7 @@ SUITES: dict[str, Suite] = {
         layers,
         channels,
         grouped,
+        pools,
         dtypes,
         levels,
         peers,
