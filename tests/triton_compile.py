@@ -36,8 +36,10 @@ FORWARD = ("output_ptr", "input_ptr", "weight_ptr", "bias_ptr")
 def layer(
     channels: int, dtype: torch.dtype, groups: int = 1, kernel: int = 3, axes: int = 1
 ) -> Any:
-    return conv.Conv(8, channels, (240, 320), channels, (kernel, kernel), (1, 1),
-                     (kernel // 2,) * 2, (1, 1), groups, (240, 320), axes, dtype)  # fmt: skip
+    return conv.Conv(batch=8, channels=channels, size=(240, 320), kernel=(kernel, kernel),
+                     stride=(1, 1), padding=(kernel // 2,) * 2, dilation=(1, 1),
+                     output=(240, 320), axes=axes, dtype=dtype, out_channels=channels,
+                     groups=groups)  # fmt: skip
 
 
 def jobs(full: bool) -> Iterator[tuple[str, Any, dict[str, Any]]]:
