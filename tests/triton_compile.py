@@ -87,8 +87,7 @@ CUTS = {"forward": tiles.forward_tiles, "backward_data": tiles.data_tiles,
         "backward_weight": tiles.weight_tiles}  # fmt: skip
 
 
-def compiled(kernel: str, given: dict[str, Any], capability: int) -> Any:
-    function = KERNELS[kernel]
+def compiled(function: Any, given: dict[str, Any], capability: int) -> Any:
     signature: dict[str, str] = {}
     constants: dict[str, Any] = {}
     aligned: dict[tuple[int, ...], list[list[Any]]] = {}
@@ -131,7 +130,7 @@ def main() -> None:
         for kernel, one, options in jobs(full):
             for cut in CUTS[kernel](one)[: None if full else 1]:
                 given = specification(kernel, one, options, cut)
-                result = compiled(kernel, given, capability)
+                result = compiled(KERNELS[kernel], given, capability)
                 ptx = result.asm["ptx"]
                 print(json.dumps({
                     "kernel": kernel, "sm": capability, "dtype": str(one.dtype),

@@ -82,7 +82,7 @@ def avg_forward_kernel(
     BLOCK_CHANNELS: tl.constexpr,
 ):
     """A (pixels, channels) tile of the averages, (N, Ho, Wo, C)."""
-    tile, _, channel = block_of_channels(channels, BLOCK_CHANNELS)
+    tile, part, channel = block_of_channels(channels, BLOCK_CHANNELS)
     exists = channel < channels
     image = Image(input_ptr, channels, height, width, guide_ptr, tolerance_ptr)
     pixels = tile_of_pixels(

@@ -56,7 +56,7 @@ def evening(image, pixels, samples):
         for j in tl.static_range(2):
             weight = share(samples.fraction_y, i) * share(samples.fraction_x, j)
             slope_y, slope_x = slopes_of_corner(samples, i, j)
-            seen, _ = corner(image, pixels, samples, i, j)
+            seen, step = corner(image, pixels, samples, i, j)
             total += tl.where(seen, weight, 0.0)
             hidden += tl.where(seen, 0.0, weight)
             drift_y += tl.where(seen, slope_y, 0.0)
@@ -100,7 +100,7 @@ def max_forward_kernel(
     BLOCK_CHANNELS: tl.constexpr,
 ):
     """A (pixels, channels) tile of the maxima and of their taps' numbers, both (N, Ho, Wo, C)."""
-    tile, _, channel = block_of_channels(channels, BLOCK_CHANNELS)
+    tile, part, channel = block_of_channels(channels, BLOCK_CHANNELS)
     exists = channel < channels
     image = Image(input_ptr, channels, height, width, guide_ptr, tolerance_ptr)
     pixels = tile_of_pixels(
@@ -118,7 +118,7 @@ def max_forward_kernel(
         present = samples.reached
         total = samples.fraction_y
         if guide_ptr is not None:
-            total, _, _, present = evening(image, pixels, samples)
+            total, drift_y, drift_x, present = evening(image, pixels, samples)
         value = tl.zeros((BLOCK_PIXELS, BLOCK_CHANNELS), ACC)
         first = input_ptr + (samples.place * channels)[:, None] + channel[None, :]
         for i in tl.static_range(2):
@@ -201,7 +201,7 @@ def max_backward_kernel(
         image, beside, tap, KERNEL_Y, KERNEL_X, DILATION_Y, DILATION_X, LIMIT, True
     )
     if guide_ptr is not None:
-        total, drift_y, drift_x, _ = evening(image, beside, samples)
+        total, drift_y, drift_x, present = evening(image, beside, samples)
     rise_y = tl.zeros((BLOCK_PIXELS, BLOCK_CHANNELS), ACC)
     rise_x = tl.zeros((BLOCK_PIXELS, BLOCK_CHANNELS), ACC)
     first = samples.place * channels + channel[None, :]

@@ -268,8 +268,9 @@ def _launch(
 ) -> None:
     if not layer.pixels:
         return
+    candidates = pool_tiles(layer, "backward" in name)
     with on_device(input):
-        run(fastest(name, layer, variant, pool_tiles(layer), run, input.device))
+        run(fastest(name, layer, variant, candidates, run, input.device))
 
 
 def _narrowed(grads: tuple[Tensor, Tensor], input: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:

@@ -58,7 +58,7 @@ def weight_of_samples(image, pixels, samples):
     for i in tl.static_range(2):
         for j in tl.static_range(2):
             weight = share(samples.fraction_y, i) * share(samples.fraction_x, j)
-            seen, _ = corner(image, pixels, samples, i, j)
+            seen, step = corner(image, pixels, samples, i, j)
             total += tl.where(seen, weight, 0.0)
     return total
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 import triton
 
 from .layer import Layer
 
-#: Lanes of a tile of which every thread has eight.
-_LANES = 1024
+#: Lanes of a tile: so many of a thread's fit its registers.
+_FORWARD_LANES = 1024
+_BACKWARD_LANES = 512
 _MOST_CHANNELS = 64
 
 
@@ -36,8 +38,10 @@ class PoolTiles:
         }
 
 
-def pool_tiles(layer: Layer) -> list[PoolTiles]:
+def pool_tiles(layer: Layer, backward: bool) -> list[PoolTiles]:
     """Ways to cut a pool, the one to take without a choice first."""
-    channels = min(_MOST_CHANNELS, triton.next_power_of_2(layer.channels))
-    pixels = _LANES // channels
+    power: int = triton.next_power_of_2(layer.channels)
+    channels = min(_MOST_CHANNELS, power)
+    lanes = _BACKWARD_LANES if backward else _FORWARD_LANES
+    pixels = lanes // channels // (2 if layer.dtype == torch.float64 else 1)
     return [PoolTiles(pixels, channels, 4), PoolTiles(pixels // 2, channels, 4)]
