@@ -66,22 +66,19 @@ def test_guide(case: dict[str, Any], guide: str) -> None:
     assert not torch.equal(out, replace(problem, guide=None).run())
 
 
-@pytest.mark.parametrize("case", GUIDED, ids=name_of)
-@pytest.mark.parametrize("fraction", [2.0**-24, 3 * 2.0**-24, 2.0**-26])
+@pytest.mark.parametrize("case", [GUIDED[0], GUIDED[2]], ids=name_of)
+@pytest.mark.parametrize("fraction", [2.0**-26, 3 * 2.0**-26])
 def test_what_a_guide_leaves_of_a_sample_may_weigh_next_to_nothing(
     case: dict[str, Any], fraction: float
 ) -> None:
-    """Quotients of small weights are the CPU's, and a single corner is the sample itself."""
-    problem = make(**case, channels=1, size=(3, 4), kernel=3, stride=1, guide="levels")
-    problem.scale.fill_(1 + fraction)
-    outputs, grads = [], []
-    reference = pools.Problem(**vars(problem))
-    for one in (problem, reference):
-        outputs.append(one.run())
-        grads.append(one.gradients(torch.ones_like(outputs[0])))
-    torch.testing.assert_close(*outputs, rtol=1e-5, atol=1e-6)
+    """Which weights are none, and quotients of the others, are the CPU's."""
+    problem = make(**case, channels=1, kernel=3, stride=1, guide="levels", axes=2)
+    problem.scale[:, 0] = fraction
+    out, expected = problem.run(), pools.Problem(**vars(problem))
+    torch.testing.assert_close(out, expected.run(), rtol=1e-5, atol=1e-6)
+    grads, wanted = (one.gradients(torch.ones_like(out)) for one in (problem, expected))
     for name in pools.GRADIENTS:
-        torch.testing.assert_close(grads[0][name], grads[1][name], rtol=1e-5, atol=1e-5)
+        torch.testing.assert_close(grads[name], wanted[name], rtol=1e-5, atol=1e-5)
 
 
 def test_a_guide_that_would_hide_every_tap_does_not_apply_to_a_maximum() -> None:

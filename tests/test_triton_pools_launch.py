@@ -82,6 +82,9 @@ def test_winners_that_no_forward_gave() -> None:
     winner = torch.randint(0, 256, (1, 5, 6, 3), dtype=torch.uint8, device=DEVICE)
     grads = pool_kernels.max_pool2d_backward(x, x, scale, rest[0], winner, rest[1], *window)
     assert all(g.isfinite().all() for g in grads)
+    nothing, bad = torch.full_like(winner, 9), torch.full_like(x, torch.nan)
+    grads = pool_kernels.max_pool2d_backward(x, bad, scale, rest[0], nothing, rest[1], *window)
+    assert not any(g.any() for g in grads)
     for wrong in (winner[..., :2], winner.float()):
         with pytest.raises(RuntimeError, match="winner"):
             pool_kernels.max_pool2d_backward(x, x, scale, rest[0], wrong, rest[1], *window)

@@ -43,10 +43,9 @@ def fixed_divisor(
 @triton.jit
 def average(total, divisor):
     """(pixels, channels) by divisors of the pixels, 0 where the divisor is."""
-    by = tl.where(divisor != 0, divisor, 1.0)
-    # Both as large as the quotient: a precise division does not make them so.
-    by = tl.zeros_like(total) + by[:, None]
-    return tl.where((divisor != 0)[:, None], divide(total, by), 0.0)
+    # As large as the quotient: a precise division does not make it so.
+    by = tl.zeros_like(total) + divisor[:, None]
+    return tl.where(by != 0, divide(total, by), 0.0)
 
 
 @triton.jit
@@ -187,8 +186,11 @@ def avg_backward_kernel(
         )
         if NEED_SCALE:
             along_y, along_x = rise_of_samples(image, pixels, samples, channel, exists, mean)
-            rise_y += pulled * along_y
-            rise_x += pulled * along_x
+            if AXES == 2:
+                rise_y += pulled * along_y
+                rise_x += pulled * along_x
+            else:
+                rise_y += pulled * (along_y + along_x)
         if NEED_INPUT:
             scatter(
                 sums_ptr, factors_ptr, extent, image, pixels, samples, channel, exists, pulled,
@@ -196,8 +198,6 @@ def avg_backward_kernel(
             )  # fmt: skip
     if NEED_SCALE:
         into = partial_ptr + part * scales + pixels.scale_at
+        tl.store(into, tl.sum(rise_y, axis=1), mask=pixels.exist)
         if AXES == 2:
-            tl.store(into, tl.sum(rise_y, axis=1), mask=pixels.exist)
             tl.store(into + plane, tl.sum(rise_x, axis=1), mask=pixels.exist)
-        else:
-            tl.store(into, tl.sum(rise_y + rise_x, axis=1), mask=pixels.exist)

@@ -221,8 +221,13 @@ def max_backward_kernel(
                 counts = seen & ((weight != 0) | (tl.abs(value) < float("inf")))
                 pulled = value * grad
                 # Where a sample does not move, 0 * inf must not appear.
-                rise_y += tl.where(counts & (slope_y != 0), slope_y * pulled, 0.0)
-                rise_x += tl.where(counts & (slope_x != 0), slope_x * pulled, 0.0)
+                along_y = tl.where(counts & (slope_y != 0), slope_y * pulled, 0.0)
+                along_x = tl.where(counts & (slope_x != 0), slope_x * pulled, 0.0)
+                if AXES == 2:
+                    rise_y += along_y
+                    rise_x += along_x
+                else:
+                    rise_y += along_y + along_x
             if NEED_INPUT:
                 accumulate(
                     sums_ptr, first + step * channels, weight * grad, seen & (weight != 0),
@@ -230,8 +235,6 @@ def max_backward_kernel(
                 )  # fmt: skip
     if NEED_SCALE:
         into = partial_ptr + part * scales + pixels.scale_at
+        tl.store(into, tl.sum(rise_y, axis=1), mask=pixels.exist)
         if AXES == 2:
-            tl.store(into, tl.sum(rise_y, axis=1), mask=pixels.exist)
             tl.store(into + plane, tl.sum(rise_x, axis=1), mask=pixels.exist)
-        else:
-            tl.store(into, tl.sum(rise_y + rise_x, axis=1), mask=pixels.exist)
