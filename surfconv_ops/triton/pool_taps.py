@@ -66,9 +66,9 @@ def weight_of_samples(image, pixels, samples):
 @triton.jit
 def slopes_of_corner(samples, SIDE_Y: tl.constexpr, SIDE_X: tl.constexpr):
     """Derivatives of a corner's weight with respect to both scales."""
-    along_y = (0.5 * (2 * SIDE_Y - 1)) * samples.doubled_y * share(samples.fraction_x, SIDE_X)
-    along_x = (0.5 * (2 * SIDE_X - 1)) * samples.doubled_x * share(samples.fraction_y, SIDE_Y)
-    return along_y, along_x
+    tap_y = samples.doubled_y.to(samples.fraction_y.dtype) * (SIDE_Y - 0.5)
+    tap_x = samples.doubled_x.to(samples.fraction_x.dtype) * (SIDE_X - 0.5)
+    return tap_y * share(samples.fraction_x, SIDE_X), tap_x * share(samples.fraction_y, SIDE_Y)
 
 
 @triton.jit
