@@ -29,7 +29,7 @@ def _fake(input: Tensor, scale: Tensor, *_: Any) -> Tensor:
     return empty_output(input, scale)
 
 
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+def save_forward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     input, scale, guide, *options = inputs
     ctx.save_for_backward(input, scale, guide)
     ctx.options = options
@@ -66,7 +66,7 @@ class SurfAvgPool2dFunction(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _save(ctx, inputs, output)
+        save_forward(ctx, inputs, output)
 
     @staticmethod
     def backward(ctx: Any, grad_output: Tensor) -> Grads:
@@ -126,4 +126,4 @@ class SurfAvgPool2dBackwardFunction(torch.autograd.Function):
         )
 
 
-register("surf_avg_pool2d", _save, _op, _backward_op, pool_reference.avg_backward)
+register("surf_avg_pool2d", save_forward, _op, _backward_op, pool_reference.avg_backward)

@@ -34,7 +34,7 @@ def _fake(
     return empty_output(input, scale), input.new_empty(shape, dtype=dtype)
 
 
-def _save(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
+def save_forward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     input, scale, guide, *options = inputs
     ctx.mark_non_differentiable(output[1])
     ctx.save_for_backward(input, scale, guide, output[1])
@@ -70,7 +70,7 @@ class SurfMaxPool2dFunction(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
-        _save(ctx, inputs, output)
+        save_forward(ctx, inputs, output)
 
     @staticmethod
     def backward(ctx: Any, grad_output: Tensor, _: Any) -> Grads:
@@ -130,4 +130,4 @@ class SurfMaxPool2dBackwardFunction(torch.autograd.Function):
         )
 
 
-register("surf_max_pool2d", _save, _op, _backward_op, pool_reference.max_backward)
+register("surf_max_pool2d", save_forward, _op, _backward_op, pool_reference.max_backward)

@@ -73,7 +73,8 @@ def _avg_backward(
     return _laid_out(grads, input, scale, rest[-2:])
 
 
-_KERNELS: dict[str, Callable[..., Any]] = {
+#: By the operators' names.
+KERNELS: dict[str, Callable[..., Any]] = {
     "surf_max_pool2d": _max_forward,
     "surf_max_pool2d_backward": _max_backward,
     "surf_avg_pool2d": _avg_forward,
@@ -83,7 +84,7 @@ _KERNELS: dict[str, Callable[..., Any]] = {
 
 def register(library: torch.library.Library) -> None:
     """Register the reference as the kernel of every device that has none of its own."""
-    for name, kernel in _KERNELS.items():
+    for name, kernel in KERNELS.items():
         if missing_library_reason is not None:
             library.define(SCHEMAS[name])
         library.impl(name, kernel, "CompositeExplicitAutograd")

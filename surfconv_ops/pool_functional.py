@@ -7,7 +7,7 @@ from torch import Tensor
 from .avg_pool_ops import SurfAvgPool2dFunction
 from .checks import PairArgument
 from .max_pool_ops import SurfMaxPool2dFunction
-from .pool_validation import check_divisor, check_pool, check_pool_input, check_pool_window
+from .pool_validation import check_avg_pool, check_max_pool
 
 
 def surf_max_pool2d(
@@ -73,13 +73,10 @@ def surf_max_pool2d(
         >>> surf_max_pool2d(x, (1, 3), 1, (0, 1), scale=torch.full((1, 1, 5), 2.0))
         tensor([[[[2., 9., 2., 9., 2.]]]])
     """
-    batched = check_pool_input(input, scale, guide)
-    size = (input.shape[-2], input.shape[-1])
-    window = check_pool_window(size, kernel_size, stride, padding, dilation, ceil_mode)
-    arguments = check_pool(input, scale, guide, guide_tolerance, window)
-    output: Tensor = SurfMaxPool2dFunction.apply(
-        *arguments, window.kernel, window.stride, window.padding_before, window.dilation
-    )[0]
+    arguments, batched = check_max_pool(
+        input, kernel_size, stride, padding, dilation, ceil_mode, scale, guide, guide_tolerance
+    )
+    output: Tensor = SurfMaxPool2dFunction.apply(*arguments)[0]
     return output if batched else output.squeeze(0)
 
 
@@ -139,17 +136,17 @@ def surf_avg_pool2d(
         >>> surf_avg_pool2d(x, (1, 3), 1, (0, 1), scale=torch.full((1, 1, 5), 0.0))
         tensor([[[[1., 5., 3., 9., 0.]]]])
     """
-    batched = check_pool_input(input, scale, guide)
-    size = (input.shape[-2], input.shape[-1])
-    window = check_pool_window(size, kernel_size, stride, padding, 1, ceil_mode)
-    divisor = check_divisor(divisor_override)
-    arguments = check_pool(input, scale, guide, guide_tolerance, window)
-    output: Tensor = SurfAvgPool2dFunction.apply(
-        *arguments,
-        window.kernel,
-        window.stride,
-        window.padding_before,
-        bool(count_include_pad),
-        divisor or 0,
+    arguments, batched = check_avg_pool(
+        input,
+        kernel_size,
+        stride,
+        padding,
+        ceil_mode,
+        count_include_pad,
+        divisor_override,
+        scale,
+        guide,
+        guide_tolerance,
     )
+    output: Tensor = SurfAvgPool2dFunction.apply(*arguments)
     return output if batched else output.squeeze(0)

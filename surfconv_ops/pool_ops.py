@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import pool_fallback
+from . import cuda_pool_ops, pool_fallback
 from .layout import memory_format_of
 from .ops import Library
 from .vmap import vmap_pool_backward, vmap_pool_forward
@@ -24,6 +24,7 @@ Grads = tuple[Tensor | None, ...]
 # Kept for the life of the process: what it registered goes when it goes.
 library = Library("surfconv", "FRAGMENT")
 pool_fallback.register(library)
+cuda_pool_ops.register(library)
 
 
 def empty_output(input: Tensor, scale: Tensor) -> Tensor:

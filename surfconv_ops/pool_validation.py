@@ -102,3 +102,45 @@ def check_pool_input(input: Any, scale: Any, guide: Any) -> bool:
     if input.shape[-3] < 1:
         raise ValueError(f"input: expected at least one channel, got {tuple(input.shape)}")
     return bool(input.ndim == 4)
+
+
+def check_max_pool(
+    input: Any,
+    kernel_size: PairArgument,
+    stride: PairArgument | None,
+    padding: PairArgument,
+    dilation: PairArgument,
+    ceil_mode: bool,
+    scale: Any,
+    guide: Any,
+    guide_tolerance: Any,
+) -> tuple[tuple[Any, ...], bool]:
+    """Arguments of the registered maximum, and whether input has a batch."""
+    batched = check_pool_input(input, scale, guide)
+    size = (input.shape[-2], input.shape[-1])
+    window = check_pool_window(size, kernel_size, stride, padding, dilation, ceil_mode)
+    tensors = check_pool(input, scale, guide, guide_tolerance, window)
+    options = (window.kernel, window.stride, window.padding_before, window.dilation)
+    return (*tensors, *options), batched
+
+
+def check_avg_pool(
+    input: Any,
+    kernel_size: PairArgument,
+    stride: PairArgument | None,
+    padding: PairArgument,
+    ceil_mode: bool,
+    count_include_pad: bool,
+    divisor_override: int | None,
+    scale: Any,
+    guide: Any,
+    guide_tolerance: Any,
+) -> tuple[tuple[Any, ...], bool]:
+    """Arguments of the registered average, and whether input has a batch."""
+    batched = check_pool_input(input, scale, guide)
+    size = (input.shape[-2], input.shape[-1])
+    window = check_pool_window(size, kernel_size, stride, padding, 1, ceil_mode)
+    divisor = check_divisor(divisor_override)
+    tensors = check_pool(input, scale, guide, guide_tolerance, window)
+    options = (window.kernel, window.stride, window.padding_before)
+    return (*tensors, *options, bool(count_include_pad), divisor or 0), batched

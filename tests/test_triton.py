@@ -17,7 +17,7 @@ pytest.importorskip("triton", reason="the CUDA backend's kernels need Triton")
 from surfconv_ops import reference
 from surfconv_ops import triton as backend
 from surfconv_ops.layout import memory_format_of
-from surfconv_ops.triton import conv, gradients, kernels, tiles
+from surfconv_ops.triton import gradients, kernels, layer, tiles
 
 # The interpreter computes lanes that are masked.
 pytestmark = pytest.mark.filterwarnings("ignore::RuntimeWarning")
@@ -176,7 +176,7 @@ def test_wide_positions(monkeypatch: pytest.MonkeyPatch) -> None:
     """Images whose pixels 32 bits cannot number along one axis."""
     problem = make_problem(scale="mixed", axes=2, guide="holes", dtype=torch.float64)
     narrow = problem.run(operator)
-    monkeypatch.setattr(conv, "NARROW_REACH", 1)
+    monkeypatch.setattr(layer, "NARROW_REACH", 1)
     assert_same_bits(problem.check_forward(operator), narrow)
     problem.check_gradients(operator)
 

@@ -16,7 +16,9 @@ from surfconv_ops.triton import tiles
 from surfconv_ops.triton.conv import Conv
 from surfconv_ops.triton.tiles import Tiles, data_tiles, fastest, forward_tiles, weight_tiles
 
-CONV = Conv(2, 64, (24, 32), 48, (3, 3), (1, 1), (1, 1), (1, 1), 1, (24, 32), 1, torch.float32)
+CONV = Conv(batch=2, channels=64, size=(24, 32), kernel=(3, 3), stride=(1, 1), padding=(1, 1),
+            dilation=(1, 1), output=(24, 32), axes=1, dtype=torch.float32, out_channels=48,
+            groups=1)  # fmt: skip
 SLOW, FAST, LARGE = (Tiles(pixels, 32, 32, 4, 2) for pixels in (16, 32, 64))
 GPU = torch.device("cuda", 0)
 

@@ -36,8 +36,10 @@ FORWARD = ("output_ptr", "input_ptr", "weight_ptr", "bias_ptr")
 def layer(
     channels: int, dtype: torch.dtype, groups: int = 1, kernel: int = 3, axes: int = 1
 ) -> Any:
-    return conv.Conv(8, channels, (240, 320), channels, (kernel, kernel), (1, 1),
-                     (kernel // 2,) * 2, (1, 1), groups, (240, 320), axes, dtype)  # fmt: skip
+    return conv.Conv(batch=8, channels=channels, size=(240, 320), kernel=(kernel, kernel),
+                     stride=(1, 1), padding=(kernel // 2,) * 2, dilation=(1, 1),
+                     output=(240, 320), axes=axes, dtype=dtype, out_channels=channels,
+                     groups=groups)  # fmt: skip
 
 
 def jobs(full: bool) -> Iterator[tuple[str, Any, dict[str, Any]]]:
@@ -85,8 +87,7 @@ CUTS = {"forward": tiles.forward_tiles, "backward_data": tiles.data_tiles,
         "backward_weight": tiles.weight_tiles}  # fmt: skip
 
 
-def compiled(kernel: str, given: dict[str, Any], capability: int) -> Any:
-    function = KERNELS[kernel]
+def compiled(function: Any, given: dict[str, Any], capability: int) -> Any:
     signature: dict[str, str] = {}
     constants: dict[str, Any] = {}
     aligned: dict[tuple[int, ...], list[list[Any]]] = {}
@@ -129,7 +130,7 @@ def main() -> None:
         for kernel, one, options in jobs(full):
             for cut in CUTS[kernel](one)[: None if full else 1]:
                 given = specification(kernel, one, options, cut)
-                result = compiled(kernel, given, capability)
+                result = compiled(KERNELS[kernel], given, capability)
                 ptx = result.asm["ptx"]
                 print(json.dumps({
                     "kernel": kernel, "sm": capability, "dtype": str(one.dtype),

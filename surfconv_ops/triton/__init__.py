@@ -19,6 +19,9 @@ from ..checks import PaddingArgument, PairArgument
 from ..validation import check_surf_conv2d
 from .autograd import SurfConv2dFunction
 from .interpreter import check_device
+from .pools import surf_avg_pool2d, surf_max_pool2d
+
+__all__ = ["surf_avg_pool2d", "surf_conv2d", "surf_max_pool2d"]
 
 
 def surf_conv2d(

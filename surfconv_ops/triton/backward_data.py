@@ -64,8 +64,11 @@ def pulled_by_tap(
 
 
 @triton.jit
-def rise_of_samples(image, pixels, samples, channel, exists):
-    """(pixels, channels) derivatives of a tap's samples with respect to both scales."""
+def rise_of_samples(image, pixels, samples, channel, exists, mean=None):
+    """(pixels, channels) derivatives of a tap's samples with respect to both scales.
+
+    ``mean``: comes off the values that are seen.
+    """
     along_y = tl.zeros((pixels.number.shape[0], channel.shape[0]), samples.fraction_y.dtype)
     along_x = along_y
     first = image.pointer + (samples.place * image.channels)[:, None] + channel[None, :]
@@ -79,6 +82,8 @@ def rise_of_samples(image, pixels, samples, channel, exists):
             # A finite value without weight still has the derivative of a sample on a pixel.
             weighs = (weight_y * weight_x != 0)[:, None]
             value = tl.where(weighs | (tl.abs(value) < float("inf")), value, 0.0)
+            if mean is not None:
+                value = tl.where(mask, value - mean, 0.0)
             along_y += (weight_x * (2 * i - 1))[:, None] * value
             along_x += (weight_y * (2 * j - 1))[:, None] * value
     # Where a tap does not move, 0 * inf must not appear.

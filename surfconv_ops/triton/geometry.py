@@ -32,3 +32,29 @@ def locate(centre, scale, doubled, HALF: tl.constexpr, LIMIT: tl.constexpr):
     whole = tl.floor(offset)
     whole = tl.where((doubled < 0) & (whole == offset), whole - 1, whole)
     return centre + whole.to(centre.dtype), offset - whole, reached
+
+
+@triton.jit
+def locate_clamped(centre, scale, doubled, last, HALF: tl.constexpr, LIMIT: tl.constexpr):
+    """As :func:`locate`, with samples clamped into an image that ends with pixel ``last``.
+
+    Also twice the distance that a sample moves by as the scale grows by 1: none at the edge.
+    Where the scale is exactly 1, taps outside the image are nowhere, as for nn's maximum.
+    """
+    low, fraction, near = locate(centre, scale, doubled, HALF, LIMIT)
+    before = tl.where(near, low < 0, scale * doubled < 0)
+    behind = tl.where(near, low >= last, scale * doubled > 0)
+    pixel = low + (fraction == 1).to(low.dtype)
+    outside = (scale == 1) & ((pixel < 0) | (pixel > last))
+    # Where a tap does not move, its scale does not matter.
+    finite = tl.abs(tl.where(doubled == 0, 0.0, scale)) < float("inf")
+    low = tl.where(before, 0, tl.where(behind, last, low))
+    fraction = tl.where(before | behind, 0.0, fraction)
+    return low, fraction, tl.where(before | behind, 0, doubled), finite & (outside == 0)
+
+
+@triton.jit
+def pool_window(centre, padding, size, KERNEL: tl.constexpr):
+    """Pixels of an axis under a window, padding included, what lies beyond it not."""
+    start = centre - (KERNEL - 1) // 2
+    return tl.minimum(size + padding - start, KERNEL)

@@ -8,12 +8,13 @@ from torch import Tensor
 
 from ..geometry import Pair
 from ..layout import lay_out, memory_format_of
-from .conv import Conv, channels_innermost, limits_of_view, tensor_float32
+from .conv import Conv, tensor_float32
 from .depth_to_scale import depth_to_scale, depth_to_scale_backward
 from .forward import forward_kernel
 from .gradients import Operands, gradient_of_weight, gradients_of_data
 from .interpreter import in_float32, needs_float32
 from .launch import on_device
+from .layer import channels_innermost, limits_of_view
 from .level_values import level_values
 from .tiles import Tiles, fastest, forward_tiles
 

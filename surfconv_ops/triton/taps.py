@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import triton
 import triton.language as tl
 
-from .geometry import locate, tap_doubled
+from .geometry import locate, locate_clamped, tap_doubled
 
 
 class Image(NamedTuple):
@@ -38,7 +38,7 @@ class Pixels(NamedTuple):
 class Samples(NamedTuple):
     """Where one tap of a tile samples; a sample lies between pixel y and y + 1, x and x + 1."""
 
-    doubled_y: Any
+    doubled_y: Any  # twice what the sample moves by as the scale grows by 1
     doubled_x: Any
     y: Any
     x: Any
@@ -100,14 +100,23 @@ def samples_of(
     DILATION_Y: tl.constexpr,
     DILATION_X: tl.constexpr,
     LIMIT: tl.constexpr,
+    CLAMPED: tl.constexpr = False,
 ):
-    """Where a tile samples with one tap."""
+    """Where a tile samples with one tap; clamped, all samples are in the image."""
     doubled_y = tap_doubled(tap_y, KERNEL_Y, DILATION_Y)
     doubled_x = tap_doubled(tap_x, KERNEL_X, DILATION_X)
     half_y: tl.constexpr = 0.5 * (DILATION_Y * (KERNEL_Y - 1) % 2)
     half_x: tl.constexpr = 0.5 * (DILATION_X * (KERNEL_X - 1) % 2)
-    y, fraction_y, reached_y = locate(pixels.centre_y, pixels.scale_y, doubled_y, half_y, LIMIT)
-    x, fraction_x, reached_x = locate(pixels.centre_x, pixels.scale_x, doubled_x, half_x, LIMIT)
+    if CLAMPED:
+        y, fraction_y, doubled_y, reached_y = locate_clamped(
+            pixels.centre_y, pixels.scale_y, doubled_y, image.height - 1, half_y, LIMIT
+        )
+        x, fraction_x, doubled_x, reached_x = locate_clamped(
+            pixels.centre_x, pixels.scale_x, doubled_x, image.width - 1, half_x, LIMIT
+        )
+    else:
+        y, fraction_y, reached_y = locate(pixels.centre_y, pixels.scale_y, doubled_y, half_y, LIMIT)
+        x, fraction_x, reached_x = locate(pixels.centre_x, pixels.scale_x, doubled_x, half_x, LIMIT)
     reached = reached_y & reached_x & pixels.exist
     place = pixels.origin + y.to(tl.int64) * image.width + x
     return Samples(doubled_y, doubled_x, y, x, fraction_y, fraction_x, reached, place)

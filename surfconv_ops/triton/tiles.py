@@ -5,12 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from statistics import median
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import triton
 
 from .conv import LEAST_PRODUCT, Conv
+from .layer import Layer
 
 #: Kernels of up to this many taps are written out tap by tap.
 MOST_UNROLLED_TAPS = 9
@@ -79,17 +80,18 @@ def weight_tiles(conv: Conv) -> list[Tiles]:
     return list(dict.fromkeys([first, Tiles(32, inner, outer, 4, 3)]))
 
 
-_chosen: dict[Hashable, Tiles] = {}
+_T = TypeVar("_T")
+_chosen: dict[Hashable, Any] = {}
 
 
 def fastest(
     name: str,
-    conv: Conv,
+    layer: Layer,
     variant: Hashable,
-    candidates: Sequence[Tiles],
-    run: Callable[[Tiles], object],
+    candidates: Sequence[_T],
+    run: Callable[[_T], object],
     device: torch.device,
-) -> Tiles:
+) -> _T:
     """The candidate that ``run`` takes least time with, found once per kernel and layer.
 
     ``run`` may be called any number of times. The first candidate is taken untried off the GPU,
@@ -103,17 +105,18 @@ def fastest(
     ):
         return candidates[0]
     # Batches of nearby sizes share a choice: a net that sees many sizes is not tuned for each.
-    size = conv.pixels.bit_length()
-    layer = replace(conv, batch=0, size=(0, 0), output=(0, 0), padding=(0, 0))
-    key = (name, device.index, layer, size, variant)
+    size = layer.pixels.bit_length()
+    kind = replace(layer, batch=0, size=(0, 0), output=(0, 0), padding=(0, 0))
+    key = (name, device.index, kind, size, variant)
     if key not in _chosen:
         if torch.cuda.is_current_stream_capturing():
             return candidates[0]
         _chosen[key] = min(candidates, key=lambda tiles: _seconds(run, tiles))
-    return _chosen[key]
+    best: _T = _chosen[key]
+    return best
 
 
-def _seconds(run: Callable[[Tiles], object], tiles: Tiles) -> float:
+def _seconds(run: Callable[[_T], object], tiles: _T) -> float:
     try:
         run(tiles)
     except triton.runtime.errors.OutOfResources:
