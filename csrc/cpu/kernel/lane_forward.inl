@@ -71,6 +71,8 @@ struct LaneScratch {
   }
 };
 
+constexpr bool kManyRegisters = SURFCONV_VECTOR_BYTES == 64;  // 32, not 16
+
 // out[p] = initial + the contraction of PIXELS pixels from m on that see alike. Two at a time read
 // each weight once: loads, not products, are what there is most of.
 // In a function of its own: among its callers' variables g++ 12 keeps addresses in vector
@@ -88,7 +90,7 @@ __attribute__((noinline)) void lane_pixels(const LaneScratch<T>& scratch, int m,
   V sum[PIXELS][VECTORS];
 #pragma GCC unroll 2
   for (int p = 0; p < PIXELS; ++p) {
-#pragma GCC unroll 4
+#pragma GCC unroll 6
     for (int i = 0; i < VECTORS; ++i) sum[p][i] = load<V>(initial + i * L);
   }
   for (int64_t ty = 0; ty < rows.taps; ++ty) {
@@ -111,7 +113,7 @@ __attribute__((noinline)) void lane_pixels(const LaneScratch<T>& scratch, int m,
         const auto add = [&](auto columns_of_tap) SURFCONV_INLINED {
           constexpr int COLUMNS = decltype(columns_of_tap)::value, CORNERS = ROWS * COLUMNS;
           V of_tap[VECTORS];
-#pragma GCC unroll 4
+#pragma GCC unroll 6
           for (int i = 0; i < VECTORS; ++i) {
             of_tap[i] = load<V>(weight + i * L);
             if constexpr (PIXELS > 1) keep_in_register(of_tap[i]);
@@ -127,7 +129,7 @@ __attribute__((noinline)) void lane_pixels(const LaneScratch<T>& scratch, int m,
               from[q] = reinterpret_cast<const T*>(place + i * step_y + j * step_x);
               share[q] = weight_y[p][i] * x[p].weight[j];
             }
-#pragma GCC unroll 4
+#pragma GCC unroll 6
             for (int i = 0; i < VECTORS; ++i) {
               V sample = load<V>(from[0] + i * L) * share[0];
 #pragma GCC unroll 3
@@ -156,17 +158,20 @@ __attribute__((noinline)) void lane_pixels(const LaneScratch<T>& scratch, int m,
   }
 #pragma GCC unroll 2
   for (int p = 0; p < PIXELS; ++p) {
-#pragma GCC unroll 4
+#pragma GCC unroll 6
     for (int i = 0; i < VECTORS; ++i) store(out + p * ld_out + i * L, sum[p][i]);
   }
 }
 
-// body(first lane, Fixed<lanes>): as many vectors at a time as sums stay in registers and taps of
-// neighbouring pixels in the first-level cache.
+// body(first lane, Fixed<lanes>): as many vectors at a time as sums stay in registers. Where there
+// are few, eight of one pixel were slower than four.
 template <class T, class Body>
 void for_fixed_lanes(int64_t lanes, const Body& body) {
   constexpr int64_t L = kLanes<T>;
   int64_t c = 0;
+  if constexpr (kManyRegisters) {
+    for (; c + 6 * L <= lanes; c += 6 * L) body(c, Fixed<6 * L>{});
+  }
   for (; c + 4 * L <= lanes; c += 4 * L) body(c, Fixed<4 * L>{});
   for (; c + 2 * L <= lanes; c += 2 * L) body(c, Fixed<2 * L>{});
   for (; c + L <= lanes; c += L) body(c, Fixed<L>{});
@@ -188,7 +193,7 @@ template <class T>
 void lane_forward(const Conv& conv, const Plan& plan, const Tile<T>& tile,
                   const LaneScratch<T>& scratch, const char* base, int64_t step_y, int64_t step_x,
                   const T* weights, const T* initial, T* out, int64_t ld_out) {
-  constexpr int PIXELS = SURFCONV_VECTOR_BYTES == 64 ? 2 : 1;  // 32 registers hold what two need
+  constexpr int PIXELS = kManyRegisters ? 2 : 1;
   int8_t differs[kTile] = {};
   tile.for_runs([&](const Run& run) {
     if (!lane_forward_does(tile, run)) return;
