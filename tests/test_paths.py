@@ -86,6 +86,55 @@ def test_depthwise(channels: int, kernel: int) -> None:
     check(lay_scale(problem, "holes"))
 
 
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("channels", [5, 8, 28, 60, 100])
+@pytest.mark.parametrize("kernel", [(7, 3), (2, 4)])
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
+def test_depthwise_forward(place: str, channels: int, kernel: tuple[int, int], layout: str) -> None:
+    """Vectors of every width; taps of which one side, both or neither lie in the image."""
+    problem = make_problem(
+        1, channels, channels, (13, 19), kernel, padding=3, groups=channels, layout=layout
+    )
+    lay_scale(problem, place).check_forward(surf_conv2d)
+
+
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("guide", ["levels", "depth", "holes"])
+def test_depthwise_guides(place: str, guide: str) -> None:
+    """Pixels that a guide leaves alone are done apart from those where it hides corners."""
+    problem = make_problem(
+        1,
+        24,
+        24,
+        (13, 19),
+        5,
+        padding=2,
+        groups=24,
+        guide=guide,
+        guide_tolerance=1.0,
+        layout="channels_last",
+    )
+    lay_scale(problem, place).check_forward(surf_conv2d)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16, torch.float16], ids=str)
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("channels", [12, 64])
+def test_depthwise_dtypes(dtype: torch.dtype, place: str, channels: int) -> None:
+    problem = make_problem(
+        1,
+        channels,
+        channels,
+        (9, 13),
+        3,
+        padding=1,
+        groups=channels,
+        dtype=dtype,
+        layout="channels_last",
+    )
+    lay_scale(problem, place).check_forward(surf_conv2d)
+
+
 @pytest.mark.parametrize("guide", ["levels", "depth", "holes"])
 @pytest.mark.parametrize("channels", [4, 16, 20])
 def test_guides(guide: str, channels: int) -> None:
@@ -111,15 +160,22 @@ def test_some_gradients(place: str, wanted: tuple[str, ...], groups: int) -> Non
 
 @pytest.mark.parametrize("place", ["inside", "grid", "holes"])
 @pytest.mark.parametrize("channels", [4, 8, 16, 20])
-def test_values_beyond_the_footprint_are_never_read(place: str, channels: int) -> None:
+@pytest.mark.parametrize("depthwise", [False, True])
+def test_values_beyond_the_footprint_are_never_read(
+    place: str, channels: int, depthwise: bool
+) -> None:
     """Inf and NaN in the input show where conv2d shows them at scale 1, and nowhere else inside."""
-    problem = lay_scale(make_problem(1, channels, 3, SIZE, layout="channels_last"), place)
+    outputs, groups = (channels, channels) if depthwise else (3, 1)
+    problem = make_problem(1, channels, outputs, SIZE, groups=groups, layout="channels_last")
+    problem = lay_scale(problem, place)
     clean = problem.run(surf_conv2d)
     poisoned = problem.input.clone()
     poisoned[..., 4, 11] = torch.inf
     output = replace(problem, input=poisoned).run(surf_conv2d)
     if place == "grid":
-        plain = torch.nn.functional.conv2d(poisoned, problem.weight, problem.bias, padding=1)
+        plain = torch.nn.functional.conv2d(
+            poisoned, problem.weight, problem.bias, padding=1, groups=groups
+        )
         assert torch.equal(output.isfinite(), plain.isfinite())
     touched = ~output.isfinite().all(1)
     assert touched.any() and touched[0, 4, 11]

@@ -14,7 +14,9 @@ class Forward {
         ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
         input_(conv, plan_, tensors.input),
         guide_(conv, tensors.guide),
-        writes_rows_(!plan_.lanewise && plan_.outputs == width_ &&
+        fused_(plan_.lanewise && plan_.mix == 1 && plan_.multiplier == 1),
+        writes_rows_((fused_ ? plan_.row == conv.out_channels
+                             : !plan_.lanewise && plan_.outputs == width_) &&
                      tensors.output.dtype == kComputeDType<T> && tensors.output.c == 1 &&
                      tensors.output.y == tensors.output.x * conv.x.out),
         prefetches_(plan_.row * static_cast<int64_t>(sizeof(T)) <= 64 && conv.y.kernel > 1),
@@ -31,13 +33,17 @@ class Forward {
     const int workers =
         workers_for(executor_, passes[0].images * most_tiles, conv_.y.out * conv_.batch * work);
     const int64_t need = Tile<T>::need(conv_, taps_) + Workspace::need<T>(kTile * ld_rows_) +
-                         Workspace::need<T>(kTile * plan_.groups * width_);
+                         Workspace::need<T>(kTile * plan_.groups * width_) +
+                         (fused_ ? LaneScratch<T>::need(conv_) : 0);
     Workspace memory(workers * need);
     std::vector<Scratch> scratch;
     scratch.reserve(static_cast<size_t>(workers));
     for (int i = 0; i < workers; ++i) {
-      scratch.push_back({Tile<T>(conv_, taps_, memory), memory.take<T>(kTile * ld_rows_),
-                         memory.take<T>(kTile * plan_.groups * width_)});
+      scratch.push_back({Tile<T>(conv_, taps_, memory),
+                         memory.take<T>(kTile * ld_rows_),
+                         memory.take<T>(kTile * plan_.groups * width_),
+                         {}});
+      if (fused_) scratch.back().lanes.take(conv_, memory);
     }
     for (const Pass& pass : passes) {
       input_.pack(pass, executor_);
@@ -57,6 +63,7 @@ class Forward {
     Tile<T> tile;
     T* rows;  // gathered matrix [kTile][ld_rows]
     T* out;   // [kTile][groups * width]
+    LaneScratch<T> lanes;
   };
 
   // Where the packed weights of a block of taps and channels start.
@@ -110,36 +117,38 @@ class Forward {
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
     scratch.tile.place(tensors_.scale, guide_.image(pass, n), n, begin, count, steps_y, steps_x);
     // Straight into the output where whole blocks of the product fit there.
-    const bool direct = writes_rows_ && count % kRowPad == 0;
+    const bool direct = writes_rows_ && (fused_ || count % kRowPad == 0);
     const int64_t ld_out = direct ? tensors_.output.x : plan_.groups * width_;
     T* out = direct ? static_cast<T*>(tensors_.output.data) + n * tensors_.output.n +
                           begin * tensors_.output.x
                     : scratch.out;
     const int64_t group_step = direct ? plan_.outputs : width_;
-    if (plan_.lanewise) {
-      for (int m = 0; m < count; ++m) {
-        std::memcpy(scratch.out + m * ld_out, initial_.data(), static_cast<size_t>(ld_out * bytes));
-      }
+    if (fused_) {
+      lane_forward(conv_, plan_, scratch.tile, scratch.lanes, base, steps_y.read, steps_x.read,
+                   weights_.get(), initial_.data(), out, ld_out);
     }
-    const bool fused = plan_.lanewise && plan_.mix == 1 && plan_.multiplier == 1;
-    if (fused) {
-      lane_forward(conv_, plan_, scratch.tile, base, weights_.get(), scratch.out, ld_out);
+    const bool gathers = !fused_ || (scratch.tile.guided() && scratch.tile.has(Place::other));
+    if (plan_.lanewise && gathers) {
+      for_gathered_runs(scratch.tile, count, [&](const Run& run) {
+        for (int m = run.begin; m < run.end; ++m) {
+          std::memcpy(out + m * ld_out, initial_.data(), static_cast<size_t>(width_ * bytes));
+        }
+      });
     }
-    for (int64_t first_tap = 0; first_tap < plan_.taps; first_tap += taps_) {
+    for (int64_t first_tap = 0; gathers && first_tap < plan_.taps; first_tap += taps_) {
       const int64_t taps = std::min(taps_, plan_.taps - first_tap);
-      if (fused && scratch.tile.all(Place::interior)) break;
       if (scratch.tile.has(Place::other)) {
         scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
       }
       for (const ChannelBlock& block : blocks_) {
         const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
         gather_tile(conv_, scratch.tile, first_tap, taps, base + channel * bytes, block.padded,
-                    scratch.rows, ld_rows_, !fused);
+                    scratch.rows, ld_rows_, fused_);
         if (prefetches_ && first_tap + taps == plan_.taps) {
           prefetch_ahead(scratch.tile, base, count);
         }
         if (plan_.lanewise) {
-          multiply_lanes(scratch, block, first_tap, taps, count, fused);
+          multiply_lanes(scratch, block, first_tap, taps, count, out, ld_out);
         } else {
           const bool first = first_tap == 0 && block.first == 0;
           gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded, scratch.rows,
@@ -162,18 +171,23 @@ class Forward {
     }
   }
 
+  // The pixels that are gathered, lanewise.
+  template <class Body>
+  void for_gathered_runs(const Tile<T>& tile, int count, const Body& body) const {
+    if (!fused_) return body(Run{0, count, Place::other});
+    tile.for_runs([&](const Run& run) {
+      if (!lane_forward_does(tile, run)) body(run);
+    });
+  }
+
   void multiply_lanes(Scratch& scratch, const ChannelBlock& block, int64_t first_tap, int64_t taps,
-                      int count, bool fused) const {
+                      int count, T* out, int64_t ld_out) const {
     const LaneBlock part = lane_block(plan_, block, first_tap, taps);
     with_mix<T>(plan_, [&](auto mix) {
-      const auto multiply = [&](int begin, int end) {
+      for_gathered_runs(scratch.tile, count, [&](const Run& run) {
         lane_multiply<decltype(mix)::value>(
-            part, end - begin, scratch.rows + begin * ld_rows_, ld_rows_, weights_.get(),
-            scratch.out + begin * width_ + block.first, width_, plan_.row);
-      };
-      if (!fused) return multiply(0, count);
-      scratch.tile.for_runs([&](const Run& run) {
-        if (run.place != Place::interior) multiply(run.begin, run.end);
+            part, run.end - run.begin, scratch.rows + run.begin * ld_rows_, ld_rows_,
+            weights_.get(), out + run.begin * ld_out + block.first, ld_out, plan_.row);
       });
     });
   }
@@ -199,6 +213,7 @@ class Forward {
   const int64_t taps_, width_, ld_rows_;
   InputRows<T> input_;
   GuideRows<T> guide_;
+  const bool fused_;  // lanewise without a gathered matrix, but where a guide hides corners
   const bool writes_rows_, prefetches_;
   std::vector<T> unseen_;  // what a corner outside the image reads
   std::vector<T> initial_;

@@ -98,11 +98,11 @@ void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows
   }
 }
 
-// The gathered matrix of a tile: `taps` from first_tap on, of `channels` each; interior pixels only
-// if wanted.
+// The gathered matrix of a tile: `taps` from first_tap on, of `channels` each; or only of the
+// pixels that need their corners listed.
 template <class T>
 void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64_t taps,
-                 const char* base, int64_t channels, T* to, int64_t ld, bool interior = true) {
+                 const char* base, int64_t channels, T* to, int64_t ld, bool corners_only = false) {
   const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
   tile.for_runs([&](const Run& run) {
     if (run.place == Place::other) {
@@ -111,7 +111,7 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
       }
       return;
     }
-    if (run.place == Place::interior && !interior) return;
+    if (corners_only) return;
     with_channels<T>(channels, [&](auto known) {
       if (run.place == Place::on_grid) {
         return gather_grid(conv, tile.rows(), tile.columns(), taps_y, base, run.begin, run.end,

@@ -30,6 +30,8 @@ class Tile {
   const AxisTable<T>& rows() const { return rows_; }
   const AxisTable<T>& columns() const { return columns_; }
 
+  bool guided() const { return guide_.image != nullptr; }
+
   template <class Body>
   SURFCONV_INLINE void for_runs(const Body& body) const {
     for (int i = 0; i < run_count_; ++i) body(runs_[i]);

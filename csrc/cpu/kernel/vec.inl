@@ -36,6 +36,16 @@ SURFCONV_INLINE V broadcast(T value) {
   return value - V{};
 }
 
+// g++ reads a vector that is used twice from memory twice, where memory is what there is least of.
+template <class V>
+SURFCONV_INLINE void keep_in_register(V& v) {
+#if defined(SURFCONV_X86)
+  asm("" : "+v"(v));
+#else
+  static_cast<void>(v);
+#endif
+}
+
 // Runs body(channel, Width<lanes>) over `channels`, a multiple of kQuad, widest vectors first.
 // channels is an int64_t, or a Fixed<N>: then the loop is unrolled.
 template <int N>
