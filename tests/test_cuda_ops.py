@@ -19,8 +19,8 @@ from helpers import Problem, assert_same_bits, make_problem
 from surfconv_ops import _fallback, cuda_ops, depth_to_scale, reference, surf_conv2d
 from surfconv_ops.validation import check_surf_conv2d
 
-OPERATORS = ("surf_conv2d", "surf_conv2d_backward", "level_values", "depth_to_scale",
-             "depth_to_scale_backward")  # fmt: skip
+OPERATORS = ("surf_conv2d", "surf_max_pool2d", "surf_avg_pool2d", "depth_to_scale")
+OPERATORS += (*(f"{name}_backward" for name in OPERATORS), "level_values")
 HERE = Path(__file__).parent
 
 
@@ -90,6 +90,41 @@ def test_the_registered_functions_run_the_kernels(monkeypatch: pytest.MonkeyPatc
     expected = problem.gradients(reference.surf_conv2d, grad)
     for value, (name, wanted) in zip(grads, expected.items(), strict=True):
         torch.testing.assert_close(value, wanted, msg=name)
+
+
+@pytest.mark.parametrize(("place", "shape", "words"), [
+    (0, (1, 2, 4, 5), "scale must be"), (1, (3, 4, 3, 3), "channels"), (2, (4,), "bias"),
+    (3, (1, 3, 4, 5), "scale must be"), (3, (4, 5), "4 dimensions"), (4, (2, 3, 5), "guide"),
+])  # fmt: skip
+def test_direct_calls_refuse_what_is_unsafe(place: int, shape: Any, words: str) -> None:
+    pytest.importorskip("triton")
+    from surfconv_ops.triton import kernels
+
+    arguments = list(arguments_of(make_problem(2, 2, 3, (4, 5), guide="levels")))
+    arguments[place] = torch.ones(shape)
+    with pytest.raises(RuntimeError, match=words):
+        kernels.forward(*arguments)
+    if place != 2:
+        grad = torch.ones(2, 3, 4, 5)
+        needs = (True, True, True, True)
+        with pytest.raises(RuntimeError, match=words):
+            kernels.backward(grad, *arguments[:2], *arguments[3:], *needs)
+
+
+def test_direct_calls_refuse_a_wrong_gradient() -> None:
+    pytest.importorskip("triton")
+    from surfconv_ops.triton import kernels, pool_kernels
+
+    arguments = arguments_of(make_problem(2, 3, 3, (4, 5)))
+    grad, scale = torch.ones(2, 3, 4, 4), arguments[3]
+    with pytest.raises(RuntimeError, match="grad_output"):
+        kernels.backward(grad, *arguments[:2], *arguments[3:], True, True, True, True)
+    window = ((3, 3), (1, 1), (1, 1))
+    x = arguments[0]
+    with pytest.raises(RuntimeError, match="grad_output"):
+        pool_kernels.avg_pool2d_backward(grad, x, scale, None, 0.0, *window, True, 0, True, True)
+    with pytest.raises(RuntimeError, match="scale must be"):
+        pool_kernels.max_pool2d(x, scale[:1], None, 0.0, *window, (1, 1))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)

@@ -16,7 +16,15 @@ from torch import Tensor, nn
 
 from helpers import DTYPES, GRADIENTS, SCALES, Problem, assert_same_bits, make_problem
 from operators import GEOMETRIES, name_of
-from surfconv_ops import DepthGuided, DepthLevels, SurfConv2d, convert_conv2d, surf_conv2d
+from surfconv_ops import (
+    DepthGuided,
+    DepthLevels,
+    SurfAvgPool2d,
+    SurfConv2d,
+    SurfMaxPool2d,
+    convert_conv2d,
+    surf_conv2d,
+)
 
 pytestmark = [
     pytest.mark.gpu,
@@ -150,6 +158,21 @@ def test_compiles_into_one_graph() -> None:
     torch._dynamo.reset()
     net, inputs = Net().cuda(), frame()
     assert_close(step(torch.compile(net, fullgraph=True), net, *inputs), step(net, net, *inputs))
+
+
+@pytest.mark.parametrize("pool", [SurfMaxPool2d, SurfAvgPool2d])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16], ids=str)
+def test_pools_agree_with_the_cpu(pool: type[nn.Module], dtype: torch.dtype) -> None:
+    layer = pool(3, 2, 1, reference_depth=3.0)
+    x, depth = frame()
+    results = []
+    for device in ("cuda", "cpu"):
+        input = x.to(device, dtype).requires_grad_()
+        z = depth.to(device).requires_grad_()
+        out = layer(input, z)
+        grads = torch.autograd.grad(out.float().square().sum(), (input, z))
+        results.append([t.detach().float().cpu() for t in (out, *grads)])
+    assert_close(*results, tolerance=1e-4 if dtype == torch.float32 else 1e-2)
 
 
 def test_converted_net() -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..geometry import Pair
-from .layer import Layer, layer_of
+from .layer import Layer, layer_of, refuse
 
 #: Groups narrower than this on both sides are computed channel by channel: padded to what a
 #: matrix product takes, most of it would be padding.
@@ -35,7 +35,21 @@ class Conv(Layer):
         groups: int,
     ) -> Conv:
         """The sizes of checked arguments in the registered operator's form."""
-        out_channels, _, kernel_y, kernel_x = weight.shape
+        refuse((weight.ndim == 4, "surf_conv2d: weight must have 4 dimensions"))
+        out_channels, group_channels, kernel_y, kernel_x = weight.shape
+        refuse(
+            (
+                groups > 0
+                and out_channels % groups == 0
+                and group_channels > 0
+                and input.shape[1] == group_channels * groups,
+                "surf_conv2d: channels of input and weight do not match groups",
+            ),
+            (
+                weight.dtype == input.dtype and weight.device == input.device,
+                "surf_conv2d: weight must have the input's dtype and device",
+            ),
+        )
         layer = layer_of(input, scale, (kernel_y, kernel_x), stride, padding, dilation)
         return cls(**vars(layer), out_channels=out_channels, groups=groups)
 

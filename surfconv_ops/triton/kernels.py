@@ -14,7 +14,7 @@ from .forward import forward_kernel
 from .gradients import Operands, gradient_of_weight, gradients_of_data
 from .interpreter import in_float32, needs_float32
 from .launch import on_device
-from .layer import channels_innermost, limits_of_view
+from .layer import channels_innermost, check_grad_output, check_maps, limits_of_view, refuse
 from .level_values import level_values
 from .tiles import Tiles, fastest, forward_tiles
 
@@ -38,7 +38,9 @@ def forward(
         options = (guide, guide_tolerance, stride, padding, dilation, groups)
         wide: Tensor = in_float32(forward, (input, weight, bias, scale, *options))
         return wide.to(input.dtype)
+    check_maps("surf_conv2d", input, scale, guide)
     conv = Conv.of(input, weight, scale, stride, padding, dilation, groups)
+    refuse((bias is None or bias.shape == (conv.out_channels,), "surf_conv2d: bias must be (O,)"))
     shape = (conv.batch, *conv.output, conv.out_channels)
     output = torch.empty(shape, dtype=conv.dtype, device=input.device)
     if output.numel():
@@ -95,7 +97,10 @@ def backward(
         models = (input, weight, weight, scale)
         narrow = [grad.to(model.dtype) for grad, model in zip(wide, models, strict=True)]
         return narrow[0], narrow[1], narrow[2], narrow[3]
+    check_maps("surf_conv2d_backward", input, scale, guide)
     conv = Conv.of(input, weight, scale, stride, padding, dilation, groups)
+    shape = (conv.batch, conv.out_channels, *conv.output)
+    check_grad_output("surf_conv2d_backward", grad_output, shape)
     grads = [input.new_empty(0), weight.new_empty(0), weight.new_empty(0), scale.new_empty(0)]
     with on_device(input):
         outer, image = channels_innermost(grad_output), channels_innermost(input)

@@ -41,6 +41,11 @@ class Layer:
         return self.output[0] * self.output[1]
 
     @property
+    def output_shape(self) -> tuple[int, ...]:
+        """Of a pool."""
+        return (self.batch, self.channels, *self.output)
+
+    @property
     def pixels(self) -> int:
         """Output pixels of the whole batch."""
         return self.batch * self.plane
@@ -106,6 +111,38 @@ def layer_of(
         axes=axes,
         dtype=input.dtype,
     )
+
+
+def refuse(*conditions: tuple[bool, str]) -> None:
+    """Raise RuntimeError for the first condition that does not hold.
+
+    Messages for users come from the Python validator; here is what memory safety needs where an
+    operator is called directly.
+    """
+    for holds, message in conditions:
+        if not holds:
+            raise RuntimeError(message)
+
+
+def check_maps(name: str, input: Tensor, scale: Tensor, guide: Tensor | None) -> None:
+    """What operator ``name`` needs of its maps."""
+    batch = input.shape[0]
+    refuse(
+        (input.ndim == 4 and scale.ndim == 4, f"{name}: input and scale must have 4 dimensions"),
+        (
+            scale.ndim == 4 and scale.shape[0] == batch and scale.shape[1] in (1, 2),
+            f"{name}: scale must be (N, 1 or 2, Ho, Wo)",
+        ),
+        (
+            guide is None or guide.shape == (batch, *input.shape[2:]),
+            f"{name}: guide must be (N, H, W)",
+        ),
+    )
+
+
+def check_grad_output(name: str, grad_output: Tensor, shape: tuple[int, ...]) -> None:
+    """What operator ``name`` needs of its output's gradient."""
+    refuse((grad_output.shape == shape, f"{name}: grad_output must have the output's shape"))
 
 
 def channels_innermost(tensor: Tensor) -> Tensor:

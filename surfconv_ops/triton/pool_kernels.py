@@ -16,7 +16,15 @@ from .accumulate import Sums
 from .avg_pool import BY_NUMBER, BY_WEIGHT, BY_WINDOW, avg_backward_kernel, avg_forward_kernel
 from .interpreter import in_float32, needs_float32
 from .launch import on_device
-from .layer import Layer, channels_innermost, layer_of, limits_of_view
+from .layer import (
+    Layer,
+    channels_innermost,
+    check_grad_output,
+    check_maps,
+    layer_of,
+    limits_of_view,
+    refuse,
+)
 from .max_pool import max_backward_kernel, max_forward_kernel
 from .pool_tiles import PoolTiles, pool_tiles
 from .tiles import fastest
@@ -37,6 +45,7 @@ def max_pool2d(
         options = (guide_tolerance, kernel, stride, padding, dilation)
         wide, winner = in_float32(max_pool2d, (input, scale, guide, *options))
         return wide.to(input.dtype), winner
+    check_maps("surf_max_pool2d", input, scale, guide)
     layer = layer_of(input, scale, kernel, stride, padding, dilation)
     output = _output(layer, input)
     winner = torch.empty_like(output, dtype=winner_dtype(layer.taps))
@@ -75,10 +84,16 @@ def max_pool2d_backward(
         tensors = (grad_output, input, scale, guide, winner, guide_tolerance)
         others = (kernel, stride, padding, dilation, need_input, need_scale)
         return _narrowed(in_float32(max_pool2d_backward, (*tensors, *others)), input, scale)
+    check_maps("surf_max_pool2d_backward", input, scale, guide)
     layer = layer_of(input, scale, kernel, stride, padding, dilation)
+    check_grad_output("surf_max_pool2d_backward", grad_output, layer.output_shape)
     shape = (layer.batch, *layer.output, layer.channels)
-    if winner.shape != shape or winner.dtype != winner_dtype(layer.taps):
-        raise RuntimeError("surf_max_pool2d_backward: winner must be what the forward returned")
+    refuse(
+        (
+            winner.shape == shape and winner.dtype == winner_dtype(layer.taps),
+            "surf_max_pool2d_backward: winner must be what the forward returned",
+        )
+    )
     # At most one tap of every output pixel sends a channel's gradient on, divided up.
     bound = (layer.pixels, 1.0)
     gradients = _Gradients(layer, grad_output, input, scale, bound, need_input, need_scale)
@@ -123,6 +138,7 @@ def avg_pool2d(
         tensors = (input, scale, guide, guide_tolerance)
         wide: Tensor = in_float32(avg_pool2d, (*tensors, *options))
         return wide.to(input.dtype)
+    check_maps("surf_avg_pool2d", input, scale, guide)
     layer = layer_of(input, scale, kernel, stride, padding, (1, 1))
     output = _output(layer, input)
     view = limits_of_view(guide, guide_tolerance, layer.compute_dtype)
@@ -164,7 +180,9 @@ def avg_pool2d_backward(
         tensors = (grad_output, input, scale, guide, guide_tolerance, kernel, stride, padding)
         others = (count_include_pad, divisor_override, need_input, need_scale)
         return _narrowed(in_float32(avg_pool2d_backward, (*tensors, *others)), input, scale)
+    check_maps("surf_avg_pool2d_backward", input, scale, guide)
     layer = layer_of(input, scale, kernel, stride, padding, (1, 1))
+    check_grad_output("surf_avg_pool2d_backward", grad_output, layer.output_shape)
     # No tap weighs more than 1, nor more than a divisor that its weight is a part of.
     bound = (layer.pixels * layer.taps, 1.0 / abs(divisor_override or 1))
     gradients = _Gradients(layer, grad_output, input, scale, bound, need_input, need_scale)
