@@ -183,3 +183,21 @@ def test_values_beyond_the_footprint_are_never_read(
     reach = 4  # scale at most 2.0, a tap's far corner one more
     assert not touched[:, : 4 - reach + 1].any()
     assert not touched[..., : 11 - reach].any() and not touched[..., 11 + reach + 1 :].any()
+
+
+@pytest.mark.parametrize("groups", [1, 8])
+def test_centres_outside_the_image_see_none_of_it(groups: int) -> None:
+    """A tap of zero offset lies where its centre does: beyond a border of Inf it reads nothing."""
+    problem = make_problem(1, 8, 8, SIZE, padding=3, groups=groups, layout="channels_last")
+    problem.input[..., 0, :] = torch.inf
+    problem.input[..., :, 0] = torch.inf
+    problem.scale[...] = 1.0
+    plain = torch.nn.functional.conv2d(
+        problem.input, problem.weight, problem.bias, padding=3, groups=groups
+    )
+    assert torch.equal(problem.run(surf_conv2d).isfinite(), plain.isfinite())
+    problem.scale[...] = torch.nan  # taps of non-zero offset contribute nothing
+    alone = torch.nn.functional.conv2d(
+        problem.input, problem.weight[..., 1:2, 1:2], problem.bias, padding=2, groups=groups
+    )
+    assert torch.equal(problem.run(surf_conv2d).isfinite(), alone.isfinite())
