@@ -22,7 +22,7 @@ def backend() -> tuple[ModuleType | None, str]:
     return kernels, ""
 
 
-def _backend_for(tensor: Tensor) -> ModuleType | None:
+def backend_for(tensor: Tensor) -> ModuleType | None:
     """The module of kernels; without one, a warning that the reference runs instead."""
     kernels, reason = backend()
     if kernels is None:
@@ -31,13 +31,13 @@ def _backend_for(tensor: Tensor) -> ModuleType | None:
 
 
 def _forward(input: Tensor, *rest: Any) -> Tensor:
-    kernels = _backend_for(input)
+    kernels = backend_for(input)
     output: Tensor = (kernels or _fallback).forward(input, *rest)
     return output
 
 
 def _backward(grad_output: Tensor, *rest: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    kernels = _backend_for(grad_output)
+    kernels = backend_for(grad_output)
     grads: tuple[Tensor, Tensor, Tensor, Tensor]
     grads = (kernels or _fallback).backward(grad_output, *rest)
     return grads

@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ._fallback import warn_once
-from .cuda_ops import backend
+from .cuda_ops import backend_for
 from .pool_fallback import KERNELS
 
 
@@ -17,9 +16,7 @@ def _kernel(name: str) -> Callable[..., Any]:
     """Operator ``surf_{name}``'s; without Triton it runs the reference, and says so once."""
 
     def call(first: Tensor, *rest: Any) -> Any:
-        kernels, reason = backend()
-        if kernels is None:
-            warn_once(first.device, reason)
+        if backend_for(first) is None:
             return KERNELS[f"surf_{name}"](first, *rest)
         from .triton import pool_kernels
 
