@@ -4,6 +4,7 @@
 
 #include "depth_to_scale.h"
 #include "level_values.h"
+#include "nearest_depth.h"
 #include "surf_conv2d.h"
 #include "surf_pool2d.h"
 
@@ -17,6 +18,7 @@ STABLE_TORCH_LIBRARY(surfconv, m) {
       "int groups, bool need_input, bool need_weight, bool need_bias, bool need_scale) "
       "-> (Tensor, Tensor, Tensor, Tensor)");
   m.def("level_values(Tensor depth, Tensor edges, Tensor values) -> Tensor");
+  m.def("nearest_depth(Tensor depth, int height, int width) -> Tensor");
   m.def(
       "depth_to_scale(Tensor depth, float reference_depth, float invalid, float low, float high, "
       "float steepest) -> Tensor");
@@ -46,6 +48,7 @@ STABLE_TORCH_LIBRARY_IMPL(surfconv, CPU, m) {
   m.impl("surf_conv2d", TORCH_BOX(&surfconv::surf_conv2d));
   m.impl("surf_conv2d_backward", TORCH_BOX(&surfconv::surf_conv2d_backward));
   m.impl("level_values", TORCH_BOX(&surfconv::level_values));
+  m.impl("nearest_depth", TORCH_BOX(&surfconv::nearest_depth));
   m.impl("depth_to_scale", TORCH_BOX(&surfconv::depth_to_scale));
   m.impl("depth_to_scale_backward", TORCH_BOX(&surfconv::depth_to_scale_backward));
   m.impl("surf_max_pool2d", TORCH_BOX(&surfconv::surf_max_pool2d));

@@ -9,7 +9,10 @@ import torch
 from torch import Tensor
 
 from . import direct
+from ._loader import missing_library_reason
 from .checks import valid_depth
+
+SCHEMA = "nearest_depth(Tensor depth, int height, int width) -> Tensor"
 
 
 def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
@@ -23,7 +26,7 @@ def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
     surface appears between two others. Gradients flow to the pixels picked.
 
     Args:
-        depth: Metres, floating point.
+        depth: Metres, float32 or float64.
         height: Rows wanted; more than there are repeats rows.
         width: Columns wanted.
 
@@ -34,24 +37,13 @@ def resize_depth(depth: Tensor, height: int, width: int) -> Tensor:
         - depth: ``(N, H, W)``
         - output: ``(N, height, width)``
     """
-    H, W = depth.shape[-2], depth.shape[-1]
-    rows, columns = _axis(H, height, depth.device), _axis(W, width, depth.device)
-    if _values_may_be_read(depth):
-        # Most pixels are no holes, and only holes need a search.
-        picked = depth.index_select(-2, rows.first).index_select(-1, columns.first)
-        if rows.largest == columns.largest == 1:
-            return picked
-        holes = (~valid_depth(picked.detach())).nonzero(as_tuple=True)
-        if not len(holes[0]):
-            return picked
-        nearest = _nearest_valid(depth, rows, columns, *holes)
-        return picked.index_put(holes, depth.reshape(-1)[nearest])
-    image = torch.arange(depth.shape[0], device=depth.device)[:, None, None]
-    row = torch.arange(height, device=depth.device)[:, None]
-    nearest = _nearest_valid(
-        depth, rows, columns, image, row, torch.arange(width, device=depth.device)
+    if direct.watched():
+        # The compiler fuses the search; sizes may be symbols to it.
+        return depth.reshape(-1)[_nearest(depth.detach(), height, width)]
+    nearest = direct.run_kernel(
+        torch.ops.surfconv.nearest_depth.default, depth.detach(), height, width
     )
-    return depth.reshape(-1)[nearest]
+    return depth.reshape(-1).index_select(0, nearest.reshape(-1)).reshape(nearest.shape)
 
 
 class _Axis(NamedTuple):
@@ -74,11 +66,13 @@ def _axis(size: int, wanted: int, device: torch.device) -> _Axis:
     return _Axis(first, end - first, -((step - size - wanted) // wanted), step in (size, wanted))
 
 
-def _nearest_valid(
-    depth: Tensor, rows: _Axis, columns: _Axis, image: Tensor, row: Tensor, column: Tensor
-) -> Tensor:
-    """Where the valid depth nearest to each pixel's first is; its first where there is none."""
+def _nearest(depth: Tensor, height: int, width: int) -> Tensor:
+    """Where in the depth the one of each pixel is, as the compiled operator has it."""
     H, W = depth.shape[-2], depth.shape[-1]
+    rows, columns = _axis(H, height, depth.device), _axis(W, width, depth.device)
+    image = torch.arange(depth.shape[0], device=depth.device)[:, None, None]
+    row = torch.arange(height, device=depth.device)[:, None]
+    column = torch.arange(width, device=depth.device)
     start = (image * H + rows.first[row]) * W + columns.first[column]
     tall, wide = rows.largest, columns.largest
     # In the order of preference: a stable sort leaves ties by row, then by column. Places come
@@ -94,11 +88,18 @@ def _nearest_valid(
         inside = (down < rows.size[row]) & (aside < columns.size[column])
         at = torch.where(inside, at, start)
     rank = torch.arange(tall * wide, dtype=torch.int32, device=depth.device).view(column_of)
-    usable = valid_depth(depth.detach().reshape(-1)[at])
+    usable = valid_depth(depth.reshape(-1)[at])
     best = torch.where(usable, rank, torch.iinfo(torch.int32).max).amin(0)
     return start + offset[torch.where(best < tall * wide, best, 0)]
 
 
-def _values_may_be_read(depth: Tensor) -> bool:
-    """Whether a shape may depend on values. A GPU would have to be waited for."""
-    return not (direct.watched() or depth.is_meta or depth.is_cuda)
+def _fake(depth: Tensor, height: int, width: int) -> Tensor:
+    return depth.new_empty((depth.shape[0], height, width), dtype=torch.int64)
+
+
+def register(library: torch.library.Library) -> None:
+    """Everything about the operator that is not in the compiled library."""
+    if missing_library_reason is not None:
+        library.define(SCHEMA)
+    library.impl("nearest_depth", _nearest, "CompositeExplicitAutograd")
+    torch.library.register_fake("surfconv::nearest_depth", _fake, lib=library)

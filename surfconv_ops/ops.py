@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import _fallback, cuda_ops, depth_ops, direct, reference
+from . import _fallback, cuda_ops, depth_ops, depth_resize, direct, reference
 from .autocast import autocast_disabled, cast_to_autocast_dtype
 from .geometry import Pair
 from .layout import memory_format_of
@@ -55,6 +55,7 @@ class Library(torch.library.Library):
 _library = Library("surfconv", "FRAGMENT")
 _fallback.register(_library)
 depth_ops.register(_library)
+depth_resize.register(_library)
 cuda_ops.register(_library)
 _forward_op = torch.ops.surfconv.surf_conv2d.default
 _backward_op = torch.ops.surfconv.surf_conv2d_backward.default

@@ -8,13 +8,16 @@ from pathlib import Path
 import pytest
 import torch
 
-from surfconv_ops import _fallback, pool_fallback
+from surfconv_ops import _fallback, depth_ops, depth_resize, pool_fallback
 
 SOURCE = Path(__file__).parent.parent / "csrc" / "library.cpp"
 SCHEMAS = {
     "surf_conv2d": _fallback.FORWARD_SCHEMA,
     "surf_conv2d_backward": _fallback.BACKWARD_SCHEMA,
     "level_values": _fallback.LEVEL_VALUES_SCHEMA,
+    "nearest_depth": depth_resize.SCHEMA,
+    "depth_to_scale": depth_ops.FORWARD_SCHEMA,
+    "depth_to_scale_backward": depth_ops.BACKWARD_SCHEMA,
 } | pool_fallback.SCHEMAS
 
 
