@@ -125,8 +125,7 @@ class BackwardTile {
       with_needs(target, [&](auto writes, auto slopes) {
         constexpr bool Writes = decltype(writes)::value;
         constexpr Slopes S = decltype(slopes)::value;
-        const bool kinks = S != Slopes::none && scratch.tile.has(Place::on_grid);
-        if (kinks || scratch.tile.has(Place::other)) {
+        if (scratch.tile.has(Place::other)) {
           scratch.tile.template fill_taps<Writes, S>(first_tap, taps, unseen_read, unseen_write);
         }
         T* weight = target.weight;
@@ -139,7 +138,8 @@ class BackwardTile {
             char* write = nullptr;
             if constexpr (Writes)
               write = target.grad_input + channel * static_cast<int64_t>(sizeof(T));
-            const ScatterTarget<T> to{read, write, scratch.dot, scratch.dot + kTile * kLanes<T>};
+            const ScatterTarget<T> to{read, write, scratch.dot, scratch.dot + kTile * kLanes<T>,
+                                      zeros_.data()};
             scatter_tile<Writes, S>(conv_, scratch.tile, first_tap, taps, to, block.padded,
                                     scratch.rows, ld_rows_);
           } else {

@@ -81,20 +81,21 @@ void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, 
   }
 }
 
-template <class T, class Channels>
+template <int KX, class T, class Channels>
 void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
                  const char* base, int begin, int end, Channels channels, T* to, int64_t ld) {
   const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
     T* out = to + m * ld;
-    walk_grid(axis_y, axis_x, rows, columns, taps_y, m,
-              [&](const TapSide<T>& y, const TapSide<T>& x, int64_t t) SURFCONV_INLINED {
-                T* place = out + t * count_of(channels);
-                const T* from = reinterpret_cast<const T*>(base + y.read[0] + x.read[0]);
-                for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-                  store(place + c, load<Vec<T, decltype(width)::lanes>>(from + c));
-                });
-              });
+    walk_grid<KX>(axis_y, axis_x, rows, columns, taps_y, m,
+                  [&](auto, auto, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
+                      SURFCONV_INLINED {
+                        T* place = out + t * count_of(channels);
+                        const T* from = reinterpret_cast<const T*>(base + y.read + x.read);
+                        for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
+                          store(place + c, load<Vec<T, decltype(width)::lanes>>(from + c));
+                        });
+                      });
   }
 }
 
@@ -113,11 +114,11 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
     }
     if (corners_only) return;
     with_channels<T>(channels, [&](auto known) {
-      if (run.place == Place::on_grid) {
-        return gather_grid(conv, tile.rows(), tile.columns(), taps_y, base, run.begin, run.end,
-                           known, to, ld);
-      }
       with_width(conv.x.kernel, [&](auto width) {
+        if (run.place == Place::on_grid) {
+          return gather_grid<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y,
+                                                     base, run.begin, run.end, known, to, ld);
+        }
         gather_interior<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y, base,
                                                 run.begin, run.end, known, to, ld);
       });

@@ -17,20 +17,27 @@ struct Pass {
 // The input rows that taps of output rows `rows` may touch, one row to spare on each side.
 template <class T>
 Rows find_reach(const Conv& conv, const View& scale, int64_t n, Rows rows) {
-  double most = 0;  // zero-offset taps stay at the centre
-  T values[kTile];
+  // Bits of magnitudes compare like the magnitudes, and whole vectors of them at a time.
+  using Bits = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
+  const T infinity = std::numeric_limits<T>::infinity();
+  Bits infinite, bits[kTile], most_bits = 0;  // zero-offset taps stay at the centre
+  std::memcpy(&infinite, &infinity, sizeof(T));
+  T values[kTile] = {};
   const int64_t end = rows.end * conv.x.out;
   for (int64_t first = rows.begin * conv.x.out; first < end; first += kTile) {
     const int64_t count = std::min<int64_t>(kTile, end - first);
     load_pixels<T>(scale, n, 0, 1, conv.x.out, first, count, values, 1, 1);
-    for (int64_t m = 0; m < count; ++m) {
-      const double value = std::fabs(static_cast<double>(values[m]));
-      if (value - value == 0) most = std::max(most, value);
+    std::memcpy(bits, values, sizeof(bits));
+    for (int m = 0; m < kTile; ++m) {
+      const Bits magnitude = bits[m] & std::numeric_limits<Bits>::max();
+      most_bits = std::max(most_bits, magnitude < infinite ? magnitude : Bits(0));
     }
   }
+  T most;
+  std::memcpy(&most, &most_bits, sizeof(T));
   const double tap = static_cast<double>(std::abs(conv.y.tap_doubled(0))) / 2;
-  const auto spread =
-      static_cast<int64_t>(std::min(most * tap + 2, static_cast<double>(conv.y.reach())));
+  const auto spread = static_cast<int64_t>(
+      std::min(static_cast<double>(most) * tap + 2, static_cast<double>(conv.y.reach())));
   const auto clamp = [&](int64_t row) { return std::min(std::max<int64_t>(row, 0), conv.y.in); };
   return {clamp(conv.y.centre_floor(rows.begin) - spread - 1),
           clamp(conv.y.centre_floor(rows.end - 1) + spread + 3)};

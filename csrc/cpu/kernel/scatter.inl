@@ -9,6 +9,7 @@ struct ScatterTarget {
   char* write;       // its gradient
   T* dot;
   T* dot_x;
+  const T* zeros;  // what lies outside the image
 };
 
 // A pixel's partial sums while its taps are walked: in a register; the narrower vectors of a

@@ -1,4 +1,5 @@
-// Scattering the taps of interior pixels, straight from the tables of the two axes.
+// Scattering the taps of interior pixels and of those on the grid, straight from the tables of the
+// two axes.
 
 // One tap in two rows and two columns, one vector of channels: along the rows first, so that the
 // weights of the two axes are enough.
@@ -75,25 +76,49 @@ void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns,
   }
 }
 
-// Pixels on the grid, where the scale's gradient is not wanted: on a kink the sides would differ.
-template <class T, class Channels>
+// Whole rows of taps of the pixels begin .. end-1, which are on the grid: the derivative is the
+// step to the pixel that a tap moves towards.
+template <bool Writes, Slopes S, int KX, class T, class Channels>
 void scatter_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
                   ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
                   int64_t ld) {
   const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
+    PixelDot<T, Channels> dot(target, m);
     T* row = matrix + m * ld;
-    walk_grid(axis_y, axis_x, rows, columns, taps_y, m,
-              [&](const TapSide<T>& y, const TapSide<T>& x, int64_t t) SURFCONV_INLINED {
-                T* place = row + t * count_of(channels);
-                const T* from = reinterpret_cast<const T*>(target.read + y.read[0] + x.read[0]);
-                T* to = reinterpret_cast<T*>(target.write + y.write[0] + x.read[0]);
-                for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-                  using V = Vec<T, decltype(width)::lanes>;
-                  store(to + c, V(load<V>(to + c) + load<V>(place + c)));
-                  store(place + c, load<V>(from + c));
-                });
-              });
+    walk_grid<KX>(axis_y, axis_x, rows, columns, taps_y, m,
+                  [&](auto r, auto c, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
+                      SURFCONV_INLINED {
+                        constexpr bool Down = S != Slopes::none && decltype(r)::value == 2;
+                        constexpr bool Aside = S != Slopes::none && decltype(c)::value == 2;
+                        const auto read = [&](bool inside, int64_t offset) SURFCONV_INLINED {
+                          return inside ? reinterpret_cast<const T*>(target.read + offset)
+                                        : target.zeros;
+                        };
+                        T* place = row + t * count_of(channels);
+                        const T* from = read(true, y.read + x.read);
+                        const T* below = read(Down && !y.at_border, y.beyond + x.read);
+                        const T* beside = read(Aside && !x.at_border, y.read + x.beyond);
+                        T* to = nullptr;
+                        if constexpr (Writes)
+                          to = reinterpret_cast<T*>(target.write + y.write + x.read);
+                        for_channels<T>(channels, [&](int64_t k, auto width) SURFCONV_INLINED {
+                          using V = Vec<T, decltype(width)::lanes>;
+                          const V gradient = load<V>(place + k), sample = load<V>(from + k);
+                          V along{}, along_x{};
+                          if constexpr (Down) along = (load<V>(below + k) - sample) * y.tap;
+                          if constexpr (Aside) along_x = (load<V>(beside + k) - sample) * x.tap;
+                          if constexpr (S == Slopes::one && (Down || Aside)) {
+                            dot.add(V(along + along_x), gradient);
+                          }
+                          if constexpr (S == Slopes::two && Down) dot.add(along, gradient);
+                          if constexpr (S == Slopes::two && Aside) dot.add_x(along_x, gradient);
+                          if constexpr (Writes) store(to + k, V(load<V>(to + k) + gradient));
+                          store(place + k, sample);
+                        });
+                      });
+    if constexpr (S != Slopes::none) dot.finish();
+    if constexpr (S == Slopes::two) dot.finish_x();
   }
 }
 
@@ -103,7 +128,7 @@ void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int6
                   const ScatterTarget<T>& target, int64_t channels, T* matrix, int64_t ld) {
   const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
   tile.for_runs([&](const Run& run) {
-    if (run.place == Place::other || (run.place == Place::on_grid && S != Slopes::none)) {
+    if (run.place == Place::other) {
       for (int64_t t = 0; t < taps; ++t) {
         scatter_tap<Writes, S>(tile.tap(t), target, run.begin, run.end, channels,
                                matrix + t * channels, ld);
@@ -111,16 +136,14 @@ void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int6
       return;
     }
     with_channels<T>(channels, [&](auto known) {
-      if constexpr (S == Slopes::none) {
-        if (run.place == Place::on_grid) {
-          return scatter_grid(conv, tile.rows(), tile.columns(), taps_y, target, run.begin, run.end,
-                              known, matrix, ld);
-        }
-      }
       with_width(conv.x.kernel, [&](auto width) {
-        scatter_interior<Writes, S, decltype(width)::value>(conv, tile.rows(), tile.columns(),
-                                                            taps_y, target, run.begin, run.end,
-                                                            known, matrix, ld);
+        constexpr int KX = decltype(width)::value;
+        if (run.place == Place::on_grid) {
+          return scatter_grid<Writes, S, KX>(conv, tile.rows(), tile.columns(), taps_y, target,
+                                             run.begin, run.end, known, matrix, ld);
+        }
+        scatter_interior<Writes, S, KX>(conv, tile.rows(), tile.columns(), taps_y, target,
+                                        run.begin, run.end, known, matrix, ld);
       });
     });
   });

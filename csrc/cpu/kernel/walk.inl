@@ -54,19 +54,49 @@ SURFCONV_INLINE void walk_taps(const Axis& axis_y, const Axis& axis_x, const Axi
   }
 }
 
-// body(y, x, t) for each tap of a pixel on the grid: the sides of one corner of weight 1.
-template <class T, class Body>
+// A tap along one axis of a pixel on the grid. Bytes.
+template <class T>
+struct GridSide {
+  int64_t read, write;  // where the tap is; write: of rows
+  int64_t beyond;       // the pixel it moves towards as the scale grows
+  bool at_border;       // that one is outside the image
+  T tap;                // magnitude of tap(t)
+};
+
+template <bool TWO, class T>
+SURFCONV_INLINE GridSide<T> grid_side(const Axis& axis, const AxisTable<T>& table, int64_t t,
+                                      int m) {
+  // The side towards the centre holds the tap: see locate.
+  const int64_t tap = axis.tap_doubled(t), at = 2 * t * kTile + m;
+  const int64_t near = TWO && tap < 0 ? at + kTile : at, far = near == at ? at + kTile : at;
+  if constexpr (!TWO) return {table.read[near], table.write[near], 0, true, T(0)};
+  return {table.read[near], table.write[near], table.read[far], table.inside[far] == 0,
+          static_cast<T>(std::abs(tap)) / 2};
+}
+
+// body(rows, columns, y, x, t) for each tap of a pixel on the grid, as walk_taps has it: the tap is
+// one corner of weight 1, and rows and columns say along which axes it moves with the scale.
+template <int KX, class T, class Body>
 SURFCONV_INLINE void walk_grid(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
                                const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
-  // The side that lies towards the centre, the nearer one where the scale were a little larger.
-  const auto side = [&](const Axis& axis, const AxisTable<T>& table, int64_t t) SURFCONV_INLINED {
-    const int64_t at = (2 * t + (axis.tap_doubled(t) < 0)) * kTile + m;
-    return TapSide<T>{{table.read[at], 0}, {table.write[at], 0}, {T(1), T(0)}, T(0)};
-  };
+  using One = std::integral_constant<int, 1>;
+  using Two = std::integral_constant<int, 2>;
+  const int64_t kernel_x = KX > 0 ? KX : axis_x.kernel;
+  const int64_t fixed_x = KX > 0 ? KX / 2 : axis_x.fixed_tap();
   int64_t t = 0;
   for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty) {
-    const TapSide<T> y = side(axis_y, rows, ty);
-    for (int64_t tx = 0; tx < axis_x.kernel; ++tx, ++t) body(y, side(axis_x, columns, tx), t);
+    const auto walk_row = [&](auto rows_of_tap) SURFCONV_INLINED {
+      const auto y = grid_side<decltype(rows_of_tap)::value == 2>(axis_y, rows, ty, m);
+#pragma GCC unroll 3
+      for (int64_t tx = 0; tx < kernel_x; ++tx, ++t) {
+        if (tx == fixed_x) {
+          body(rows_of_tap, One{}, y, grid_side<false>(axis_x, columns, tx, m), t);
+        } else {
+          body(rows_of_tap, Two{}, y, grid_side<true>(axis_x, columns, tx, m), t);
+        }
+      }
+    };
+    axis_y.fixed(ty) ? walk_row(One{}) : walk_row(Two{});
   }
 }
 
