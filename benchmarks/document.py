@@ -11,6 +11,11 @@ from rows import Row
 from suites.job import Suite
 from tables import MISSED, number, table
 
+_PAGES = (
+    "Where freed blocks are kept (see allocator above), no call pays for fresh pages of memory, "
+    "whatever the calls before it freed; a program with glibc's own settings sees both."
+)
+
 
 def _verdict(row: Row) -> str:
     return MISSED if row.verdict == "missed" else row.verdict
@@ -203,7 +208,8 @@ def render(report: Report, charts: dict[str, list[str]]) -> str:
         return "\n".join([*lines, "", "No speed is reported.", ""])
     lines += [
         "Times are medians of interleaved calls: every candidate of a table runs once a round. "
-        "Ratios are ratios of medians, with the quartiles of the rounds' own ratios behind them.",
+        "Ratios are ratios of medians, with the quartiles of the rounds' own ratios behind them. "
+        + (_PAGES if "allocator" in report.machine else ""),
         "",
     ]
     lines += [line for suite in report.suites if suite.method for line in (suite.method, "")]

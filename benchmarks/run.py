@@ -23,6 +23,7 @@ from typing import Any, Protocol
 
 import torch
 
+import allocator
 import charts
 import compare
 import devices
@@ -150,7 +151,9 @@ def run(plan: Plan, device: Device | None = None) -> Report:
     suites: dict[str, Suite] = SUITES if device is None else device_suites(device)
     names = [name for name in suites if name in plan.seconds]
     about = machine.describe(plan.threads)
-    if device is not None:
+    if device is None:
+        about["allocator"] = allocator.keep_freed_blocks()
+    else:
         about |= device.facts()
     jobs = {name: suites[name].jobs(plan) for name in names}
     checks = gate(plan) if device is None else gate_device.gate(plan, device)

@@ -144,7 +144,7 @@ class BackwardTile {
                                     scratch.rows, ld_rows_);
           } else {
             gather_tile(conv_, scratch.tile, first_tap, taps, read, block.padded, scratch.rows,
-                        ld_rows_);
+                        ld_rows_, block.padded);
           }
           if (weight != nullptr) {
             weight_gradient(scratch, gradients, block, first_tap, taps, count, weight);

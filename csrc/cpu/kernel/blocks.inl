@@ -126,22 +126,15 @@ SURFCONV_INLINE int64_t taps_at_once(const Conv& conv, int64_t channels) {
 template <class T>
 void pack_forward(const View& weight, int64_t kernel_x, const Plan& plan, const ChannelBlock& block,
                   int64_t first_tap, int64_t taps, T* packed) {
-  const int64_t depth = taps * block.padded;
   for_panels<T>(plan.outputs, [&](int64_t column, int64_t columns) {
-    T* panel = packed + column * depth;
+    T* panel = packed + column * taps * block.count;
     const int64_t used = std::min(columns, plan.outputs - column);
-    for (int64_t c = 0; c < block.padded; ++c) {
-      if (c < block.count) {
-        View filter = weight;
-        advance(filter, (block.first + c) * weight.c);
-        filter.c = weight.n;
-        load_pixels<T>(filter, 0, block.group * plan.outputs + column, used, kernel_x, first_tap,
-                       taps, panel + c * columns, block.padded * columns, columns);
-      } else {
-        for (int64_t t = 0; t < taps; ++t) {
-          std::fill_n(panel + (t * block.padded + c) * columns, columns, T(0));
-        }
-      }
+    for (int64_t c = 0; c < block.count; ++c) {
+      View filter = weight;
+      advance(filter, (block.first + c) * weight.c);
+      filter.c = weight.n;
+      load_pixels<T>(filter, 0, block.group * plan.outputs + column, used, kernel_x, first_tap,
+                     taps, panel + c * columns, block.count * columns, columns);
     }
   });
 }

@@ -142,8 +142,10 @@ class Forward {
       }
       for (const ChannelBlock& block : blocks_) {
         const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
+        // What pads the channels costs the product nothing.
+        const int64_t step = plan_.lanewise ? block.padded : block.count;
         gather_tile(conv_, scratch.tile, first_tap, taps, base + channel * bytes, block.padded,
-                    scratch.rows, ld_rows_, fused_);
+                    scratch.rows, ld_rows_, step, fused_);
         if (prefetches_ && first_tap + taps == plan_.taps) {
           prefetch_ahead(scratch.tile, base, count);
         }
@@ -151,7 +153,7 @@ class Forward {
           multiply_lanes(scratch, block, first_tap, taps, count, out, ld_out);
         } else {
           const bool first = first_tap == 0 && block.first == 0;
-          gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * block.padded, scratch.rows,
+          gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * step, scratch.rows,
                          ld_rows_, packed(block, first_tap, taps), out + block.group * group_step,
                          ld_out, first ? initial_.data() + block.group * width_ : nullptr);
         }
@@ -199,7 +201,8 @@ class Forward {
     const int64_t ahead = kTilesAhead * kTile * conv_.x.stride * input_.step_x();
     const int64_t* rows = tile.rows().read + (conv_.y.kernel * 2 - 1) * kTile;
     const int64_t* columns = tile.columns().read + conv_.x.kernel / 2 * 2 * kTile;
-    for (int m = 0; m < count; ++m) {
+    const int of_line = static_cast<int>(64 / (plan_.row * static_cast<int64_t>(sizeof(T))));
+    for (int m = 0; m < count; m += of_line) {
       __builtin_prefetch(base + rows[m] + columns[m] + ahead * static_cast<int64_t>(sizeof(T)), 0,
                          2);
     }

@@ -63,17 +63,19 @@ void gather_tap(const TapCorners<T>& tap, const char* base, int begin, int end, 
   });
 }
 
-// Whole rows of taps of the interior pixels begin .. end-1, one tap after the other at to + m * ld.
+// Whole rows of taps of the interior pixels begin .. end-1, one tap after the other, a step apart,
+// at to + m * ld.
 template <int KX, class T, class Channels>
 void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
-                     const char* base, int begin, int end, Channels channels, T* to, int64_t ld) {
+                     const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
+                     int64_t step) {
   const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
     T* out = to + m * ld;
     walk_taps<KX>(axis_y, axis_x, rows, columns, taps_y, m,
                   [&](auto r, auto c, const TapSide<T>& y, const TapSide<T>& x, int64_t t)
                       SURFCONV_INLINED {
-                        T* place = out + t * count_of(channels);
+                        T* place = out + t * step;
                         sample_tap<decltype(r)::value, decltype(c)::value>(
                             base, y, x, channels,
                             [&](int64_t at, auto sum) SURFCONV_INLINED { store(place + at, sum); });
@@ -83,14 +85,15 @@ void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, 
 
 template <int KX, class T, class Channels>
 void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
-                 const char* base, int begin, int end, Channels channels, T* to, int64_t ld) {
+                 const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
+                 int64_t step) {
   const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
     T* out = to + m * ld;
     walk_grid<KX>(axis_y, axis_x, rows, columns, taps_y, m,
                   [&](auto, auto, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
                       SURFCONV_INLINED {
-                        T* place = out + t * count_of(channels);
+                        T* place = out + t * step;
                         const T* from = reinterpret_cast<const T*>(base + y.read + x.read);
                         for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
                           store(place + c, load<Vec<T, decltype(width)::lanes>>(from + c));
@@ -99,16 +102,18 @@ void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows
   }
 }
 
-// The gathered matrix of a tile: `taps` from first_tap on, of `channels` each; or only of the
+// The gathered matrix of a tile: `taps` from first_tap on, of `channels` each, a step apart, which
+// may be less than the channels: then a tap overwrites what pads the one before. Or only of the
 // pixels that need their corners listed.
 template <class T>
 void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64_t taps,
-                 const char* base, int64_t channels, T* to, int64_t ld, bool corners_only = false) {
+                 const char* base, int64_t channels, T* to, int64_t ld, int64_t step,
+                 bool corners_only = false) {
   const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
   tile.for_runs([&](const Run& run) {
     if (run.place == Place::other) {
       for (int64_t t = 0; t < taps; ++t) {
-        gather_tap(tile.tap(t), base, run.begin, run.end, channels, to + t * channels, ld);
+        gather_tap(tile.tap(t), base, run.begin, run.end, channels, to + t * step, ld);
       }
       return;
     }
@@ -117,10 +122,10 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
       with_width(conv.x.kernel, [&](auto width) {
         if (run.place == Place::on_grid) {
           return gather_grid<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y,
-                                                     base, run.begin, run.end, known, to, ld);
+                                                     base, run.begin, run.end, known, to, ld, step);
         }
         gather_interior<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y, base,
-                                                run.begin, run.end, known, to, ld);
+                                                run.begin, run.end, known, to, ld, step);
       });
     });
   });

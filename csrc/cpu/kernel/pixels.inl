@@ -170,6 +170,20 @@ SURFCONV_INLINE void for_runs(const View& view, int64_t width, int64_t first, in
 
 constexpr int64_t kStage = 64;  // pixels converted at a time between half types and transposes
 
+// Pixels whose channels lie side by side on both ends.
+template <class T>
+void copy_pixels(const T* from, int64_t from_step, int64_t channels, int64_t count, T* to,
+                 int64_t to_step) {
+  with_channels<T>(channels, [&](auto known) {
+    for (int64_t p = 0; p < count; ++p) {
+      for_channels<T>(known, [&](int64_t c, auto width) SURFCONV_INLINED {
+        using V = Vec<T, decltype(width)::lanes>;
+        store(to + p * to_step + c, load<V>(from + p * from_step + c));
+      });
+    }
+  });
+}
+
 // to[pixel * ld + channel]; channels up to `padded` become zero.
 template <class T>
 void load_pixels(const View& view, int64_t n, int64_t first_channel, int64_t channels,
@@ -180,6 +194,11 @@ void load_pixels(const View& view, int64_t n, int64_t first_channel, int64_t cha
     for_runs(view, width, first, count, [&](int64_t done, int64_t run, int64_t offset) {
       const S* from = origin + offset;
       T* rows = to + done * ld;
+      if constexpr (std::is_same_v<S, T>) {
+        if (view.c == 1 && channels % kQuad == 0) {
+          return copy_pixels(from, view.x, channels, run, rows, ld);
+        }
+      }
       if (channels == 1 && ld == 1) {
         for (int64_t p = 0; p < run; ++p) rows[p] = widen(from[p * view.x]);
       } else if (view.c != 1 && view.x == 1) {
@@ -229,6 +248,11 @@ void store_pixels(const View& view, int64_t n, int64_t first_channel, int64_t ch
     for_runs(view, width, first, count, [&](int64_t done, int64_t run, int64_t offset) {
       S* to = origin + offset;
       const T* rows = from + done * ld;
+      if constexpr (std::is_same_v<S, T>) {
+        if (view.c == 1 && channels % kQuad == 0) {
+          return copy_pixels(rows, ld, channels, run, to, view.x);
+        }
+      }
       if (view.c != 1 && view.x == 1) {
         if constexpr (std::is_same_v<S, T>) {
           transpose(rows, ld, run, channels, to, view.c);
