@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,7 +12,8 @@ import torch
 from torch import nn
 from torch.nn.functional import conv2d
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+sys.path.insert(0, str(BENCHMARKS))
 
 import candidates
 import cases
@@ -113,3 +115,24 @@ def test_voxels_hold_the_mean_of_their_points() -> None:
     assert grid.sum() == 4.0
     merged = voxelise(features, depth, 1.0, (1, 1, 1), 10.0)
     assert merged.flatten().tolist() == [2.0]
+
+
+def test_freed_blocks_are_kept() -> None:
+    """In a process of its own: the setting stays."""
+    code = """
+import resource, torch, allocator
+print(allocator.keep_freed_blocks())
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    torch.ones(4 << 20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+first = faults()
+print(first, max(faults() for _ in range(5)))
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=BENCHMARKS, check=True, timeout=120,
+                          capture_output=True, text=True)  # fmt: skip
+    kind, counts = done.stdout.splitlines()
+    if kind != "glibc, freed blocks are kept":
+        pytest.skip(f"allocator: {kind}")
+    first, later = map(int, counts.split())
+    assert later < first / 10
