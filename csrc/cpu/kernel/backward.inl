@@ -53,6 +53,7 @@ class Backward {
       lay_out_spill(pass, slots[i]);
       run_slots(pass, slots[i]);
       add_spill(pass, slots[i]);
+      add_far(pass, slots[i]);
       grad_input_.end(pass, previous == nullptr, same_image(i + 1), executor_);
       if (tensors_.grad_scale.data != nullptr) store_scale(pass);
     }
@@ -102,10 +103,14 @@ class Backward {
       const int64_t spill = byte_distance(image, next);
       slot.places = {slot.own.begin,
                      slot.own.end,
+                     slot.reach.begin,
+                     slot.reach.end,
                      step,
                      spill - slot.reach.begin * step,
                      -pass.in.begin * step,
-                     spill + (before - slot.own.end) * step};
+                     spill + (before - slot.own.end) * step,
+                     0,
+                     false};
       next += slot.spilled() * elements;
     }
   }
@@ -146,33 +151,68 @@ class Backward {
 
   void run_slot(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
                 int64_t unit, T* partial) {
-    constexpr int64_t bytes = sizeof(T);
     typename BackwardTile<T>::Target target{};
     if (tensors_.grad_weight.data != nullptr) {
       target.weight = partial + weight_offset_[static_cast<size_t>(unit)];
     }
     if (tensors_.grad_bias.data != nullptr) target.bias = partial + weight_elements_;
-    const bool scatters = grad_input_.needed();
-    const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in, scatters ? &slot.places : nullptr};
-    const AxisSteps steps_x{input_.step_x() * bytes, 1};
     target.first_pixel = pass.out.begin * conv_.x.out;
     target.pixels = pass.out.count() * conv_.x.out;
     for (int64_t i = slot.first_image; i < slot.first_image + slot.images; ++i) {
-      const int64_t n = pass.first_image + i;
-      target.input = input_.image(pass, n);
-      if (scatters) {
-        target.grad_input = reinterpret_cast<char*>(grad_input_.row(pass, n, pass.in.begin));
-      }
       if (grad_scale_) {
         target.scale = grad_scale_.get() + (unit * pass.images + i) * scale_elements(pass);
       }
-      const int64_t end = slot.out.end * conv_.x.out;
-      for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += kTile) {
-        tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(pass, n),
-                  n, begin, static_cast<int>(std::min<int64_t>(kTile, end - begin)), steps_y,
-                  steps_x);
-      }
+      run_tiles(scratch, pass, slot, i, unit, target, slot.places);
     }
+  }
+
+  // All tiles of an image of the pass; with places that are far, the tiles that reach there.
+  void run_tiles(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
+                 int64_t image, int64_t unit, typename BackwardTile<T>::Target target,
+                 RowPlaces places) {
+    constexpr int64_t bytes = sizeof(T);
+    const int64_t n = pass.first_image + image, end = slot.out.end * conv_.x.out;
+    target.input = input_.image(pass, n);
+    if (grad_input_.needed()) {
+      target.grad_input = reinterpret_cast<char*>(grad_input_.row(pass, n, pass.in.begin));
+      places.nowhere = byte_distance(target.grad_input, scratch.discard);
+    }
+    const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in,
+                            grad_input_.needed() ? &places : nullptr};
+    const AxisSteps steps_x{input_.step_x() * bytes, 1};
+    for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += kTile) {
+      const int64_t count = std::min<int64_t>(kTile, end - begin);
+      if (places.far && !is_far(slot, n, begin, count)) continue;
+      tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(pass, n), n,
+                begin, static_cast<int>(count), steps_y, steps_x);
+    }
+  }
+
+  bool is_far(const Slot& slot, int64_t n, int64_t first, int64_t count) const {
+    const T largest = largest_scale<T>(conv_, tensors_.scale, n, first, count);
+    const Rows out{first / conv_.x.out, (first + count - 1) / conv_.x.out + 1};
+    const Rows rows = rows_around(conv_, out, spread_of(conv_, largest));
+    return rows.begin < slot.reach.begin || rows.end > slot.reach.end;
+  }
+
+  // What tiles send beyond the reach of their slot: one slot after the other, by units in parallel.
+  void add_far(const Pass& pass, const std::vector<Slot>& slots) {
+    const auto far = [](const Slot& slot) { return slot.far; };
+    if (!grad_input_.needed() || std::none_of(slots.begin(), slots.end(), far)) return;
+    const int workers =
+        workers_for(executor_, units(), units() * pass.out.count() * conv_.x.out * kBlock);
+    Workspace memory(workers * tile_.need());
+    std::vector<typename BackwardTile<T>::Scratch> scratch;
+    for (int i = 0; i < workers; ++i) scratch.push_back(tile_.take(memory));
+    run_tasks(executor_, units(), workers, [&](int worker, int64_t unit) {
+      for (const Slot& slot : slots) {
+        if (!slot.far) continue;
+        RowPlaces places = slot.places;
+        places.far = true;
+        run_tiles(scratch[static_cast<size_t>(worker)], pass, slot, slot.first_image, unit, {},
+                  places);
+      }
+    });
   }
 
   void store_scale(const Pass& pass) {

@@ -11,7 +11,7 @@ class BackwardTile {
     T* grad_out;  // [groups of the unit][kTile][width]
     T* rows;      // [kTile][ld_rows]: gradient of the gathered matrix, then the matrix
     T* dot;       // [2][kTile][lanes]
-    T* discard;   // [row]: what corners that are not seen write
+    T* discard;   // [row of the image]: what corners that are not seen write
   };
   // What a task adds to.
   struct Target {
@@ -104,12 +104,12 @@ class BackwardTile {
   int64_t need() const {
     return Tile<T>::need(conv_, taps_) + Workspace::need<T>(most_groups() * kTile * width_) +
            Workspace::need<T>(kTile * ld_rows_) + Workspace::need<T>(2 * kTile * kLanes<T>) +
-           Workspace::need<T>(plan_.row + kLanes<T>);
+           Workspace::need<T>(discarded());
   }
   Scratch take(Workspace& memory) const {
     return {Tile<T>(conv_, taps_, memory), memory.take<T>(most_groups() * kTile * width_),
             memory.take<T>(kTile * ld_rows_), memory.take<T>(2 * kTile * kLanes<T>),
-            memory.take<T>(plan_.row + kLanes<T>)};
+            memory.take<T>(discarded())};
   }
 
   void run(Scratch& scratch, const Unit& unit, const Target& target, const T* guide, int64_t n,
@@ -166,6 +166,8 @@ class BackwardTile {
  private:
   using Gradients = typename OutputGradient<T>::Part;
   static constexpr int kSwappedRows = 4;
+
+  int64_t discarded() const { return conv_.x.in * plan_.row + kLanes<T>; }
 
   int64_t weight_row(const ChannelBlock& block) const {
     return plan_.taps * block.padded + 2 * kLanes<T>;

@@ -14,19 +14,19 @@ struct Pass {
   Rows in;  // of successive passes over an image neither bound goes back
 };
 
-// The input rows that taps of output rows `rows` may touch, one row to spare on each side.
+// The largest finite magnitude of the scale at `count` flat output pixels: taps of a scale that is
+// not finite stay at the centre.
 template <class T>
-Rows find_reach(const Conv& conv, const View& scale, int64_t n, Rows rows) {
+T largest_scale(const Conv& conv, const View& scale, int64_t n, int64_t first, int64_t count) {
   // Bits of magnitudes compare like the magnitudes, and whole vectors of them at a time.
   using Bits = std::conditional_t<sizeof(T) == 4, int32_t, int64_t>;
   const T infinity = std::numeric_limits<T>::infinity();
-  Bits infinite, bits[kTile], most_bits = 0;  // zero-offset taps stay at the centre
+  Bits infinite, bits[kTile], most_bits = 0;
   std::memcpy(&infinite, &infinity, sizeof(T));
-  T values[kTile] = {};
-  const int64_t end = rows.end * conv.x.out;
-  for (int64_t first = rows.begin * conv.x.out; first < end; first += kTile) {
-    const int64_t count = std::min<int64_t>(kTile, end - first);
-    load_pixels<T>(scale, n, 0, 1, conv.x.out, first, count, values, 1, 1);
+  for (const int64_t end = first + count; first < end; first += kTile) {
+    T values[kTile] = {};
+    load_pixels<T>(scale, n, 0, 1, conv.x.out, first, std::min<int64_t>(kTile, end - first), values,
+                   1, 1);
     std::memcpy(bits, values, sizeof(bits));
     for (int m = 0; m < kTile; ++m) {
       const Bits magnitude = bits[m] & std::numeric_limits<Bits>::max();
@@ -35,9 +35,19 @@ Rows find_reach(const Conv& conv, const View& scale, int64_t n, Rows rows) {
   }
   T most;
   std::memcpy(&most, &most_bits, sizeof(T));
+  return most;
+}
+
+// How many rows from its centre a tap lies at most, in whole rows with some to spare.
+template <class T>
+int64_t spread_of(const Conv& conv, T scale) {
   const double tap = static_cast<double>(std::abs(conv.y.tap_doubled(0))) / 2;
-  const auto spread = static_cast<int64_t>(
-      std::min(static_cast<double>(most) * tap + 2, static_cast<double>(conv.y.reach())));
+  return static_cast<int64_t>(
+      std::min(static_cast<double>(scale) * tap + 2, static_cast<double>(conv.y.reach())));
+}
+
+// The input rows within a spread of output rows, one row to spare on each side.
+inline Rows rows_around(const Conv& conv, Rows rows, int64_t spread) {
   const auto clamp = [&](int64_t row) { return std::min(std::max<int64_t>(row, 0), conv.y.in); };
   return {clamp(conv.y.centre_floor(rows.begin) - spread - 1),
           clamp(conv.y.centre_floor(rows.end - 1) + spread + 3)};
@@ -56,20 +66,29 @@ std::vector<Pass> make_passes(const Conv& conv, const View& scale, bool copies, 
     }
     return passes;
   }
+  std::vector<Rows> reach(static_cast<size_t>(conv.y.out));
   for (int64_t n = 0; n < conv.batch; ++n) {
+    // Rows that one output row needs anyway cost the others no memory: a depth that is far too near
+    // must not make a pass of every row that has one.
+    int64_t most = kElements / row;
+    for (int64_t y = 0; y < conv.y.out; ++y) {
+      const T largest = largest_scale<T>(conv, scale, n, y * conv.x.out, conv.x.out);
+      reach[static_cast<size_t>(y)] = rows_around(conv, {y, y + 1}, spread_of(conv, largest));
+      most = std::max(most, reach[static_cast<size_t>(y)].count());
+    }
     const size_t start = passes.size();
     for (int64_t y = 0; y < conv.y.out; ++y) {
-      const Rows reach = find_reach<T>(conv, scale, n, {y, y + 1});
+      const Rows needed = reach[static_cast<size_t>(y)];
       if (passes.size() > start) {
         Pass& last = passes.back();
-        const Rows both{std::min(last.in.begin, reach.begin), std::max(last.in.end, reach.end)};
-        if (both.count() * row <= kElements) {
+        const Rows both{std::min(last.in.begin, needed.begin), std::max(last.in.end, needed.end)};
+        if (both.count() <= most) {
           last.in = both;
           last.out.end = y + 1;
           continue;
         }
       }
-      passes.push_back({n, 1, {y, y + 1}, reach});
+      passes.push_back({n, 1, {y, y + 1}, needed});
     }
     for (size_t i = start + 1; i < passes.size(); ++i) {
       passes[i].in.end = std::max(passes[i].in.end, passes[i - 1].in.end);

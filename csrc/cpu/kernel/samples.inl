@@ -29,15 +29,21 @@ struct AxisTable {
   }
 };
 
-// Where rows of the gradient lie, in bytes from the image's first row of the pass: a task's own
-// rows in place, the ones before and after them apart.
+// Where rows of the gradient lie, in bytes from the image's first row of the pass. A task has its
+// own rows in place, and the ones before and after them apart, as far as it reaches; what taps send
+// further is added when all tasks are done: `far` then, when nothing else is.
 struct RowPlaces {
-  int64_t begin = 0, end = 0;  // own rows
+  int64_t begin = 0, end = 0;              // own rows
+  int64_t reach_begin = 0, reach_end = 0;  // with the rows apart
   int64_t step = 0;
   int64_t before = 0, own = 0, after = 0;  // where row 0 would be in each
+  int64_t nowhere = 0;                     // a row that nobody reads
+  bool far = false;
 
   int64_t operator()(int64_t row) const {
-    return row * step + (row < begin ? before : (row < end ? own : after));
+    const bool reached = (row >= reach_begin) & (row < reach_end);
+    const int64_t near = row < begin ? before : (row < end ? own : after);
+    return reached == far ? nowhere : row * step + (far ? own : near);
   }
 };
 
