@@ -110,7 +110,8 @@ class Backward {
                      -pass.in.begin * step,
                      spill + (before - slot.own.end) * step,
                      0,
-                     false};
+                     false,
+                     slot.far};
       next += slot.spilled() * elements;
     }
   }

@@ -39,11 +39,14 @@ struct RowPlaces {
   int64_t before = 0, own = 0, after = 0;  // where row 0 would be in each
   int64_t nowhere = 0;                     // a row that nobody reads
   bool far = false;
+  bool limited = false;  // some rows are sent to nowhere: comparisons that cost the others time
 
+  int64_t reached(int64_t row) const {
+    return row * step + (row < begin ? before : (row < end ? own : after));
+  }
   int64_t operator()(int64_t row) const {
-    const bool reached = (row >= reach_begin) & (row < reach_end);
-    const int64_t near = row < begin ? before : (row < end ? own : after);
-    return reached == far ? nowhere : row * step + (far ? own : near);
+    const bool in_reach = (row >= reach_begin) & (row < reach_end);
+    return in_reach == far ? nowhere : (far ? row * step + own : reached(row));
   }
 };
 
@@ -150,7 +153,13 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict sca
       const RowPlaces places = *steps.places;
       for (int side = 0; side < sides; ++side) {
         int64_t* __restrict write = table.write + at + side * kTile;
-        for (int m = 0; m < kTile; ++m) write[m] = places(static_cast<int64_t>(lo[m]) + side);
+        if (places.limited) {
+          for (int m = 0; m < kTile; ++m) write[m] = places(static_cast<int64_t>(lo[m]) + side);
+        } else {
+          for (int m = 0; m < kTile; ++m) {
+            write[m] = places.reached(static_cast<int64_t>(lo[m]) + side);
+          }
+        }
       }
     }
   }
