@@ -2,6 +2,8 @@
 
 #include <limits>
 
+#include "valid_depth.h"
+
 namespace surfconv::cpu {
 namespace {
 
@@ -10,13 +12,12 @@ namespace {
 template <class T>
 void forward(const T* __restrict depth, int64_t count, const ScaleRule<T> rule,
              T* __restrict scale) {
-  constexpr T largest = std::numeric_limits<T>::max();
   for (int64_t i = 0; i < count; ++i) {
     const T z = depth[i];
     const T wanted = (T(1) / z) * rule.reference;
     const T raised = wanted < rule.low ? rule.low : wanted;
     const T bounded = raised > rule.high ? rule.high : raised;
-    scale[i] = (z > 0) & (z <= largest) ? bounded : rule.invalid;
+    scale[i] = is_valid_depth(z) ? bounded : rule.invalid;
   }
 }
 
@@ -29,7 +30,7 @@ void backward(const T* __restrict grad, const T* __restrict depth, int64_t count
     const T inverse = T(1) / z, wanted = inverse * rule.reference, square = inverse * inverse;
     const T product = -(grad[i] * rule.reference) * square;
     // One selection after the other: g++ turns a longer condition into branches.
-    T kept = (z > 0) & (z <= largest) ? product : T(0);
+    T kept = is_valid_depth(z) ? product : T(0);
     kept = (wanted >= rule.low) & (wanted <= rule.high) ? kept : T(0);
     out[i] = (wanted / z <= rule.steepest) & (square <= largest) ? kept : T(0);
   }

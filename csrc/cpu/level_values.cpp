@@ -1,7 +1,8 @@
 #include "level_values.h"
 
 #include <algorithm>
-#include <limits>
+
+#include "valid_depth.h"
 
 namespace surfconv::cpu {
 namespace {
@@ -11,7 +12,6 @@ template <class T>
 void look_up(const T* __restrict depth, int64_t count, const T* edges, const T* values,
              int64_t levels, T* __restrict out) {
   constexpr int64_t kRun = 256;
-  const T largest = std::numeric_limits<T>::max();
   int32_t level[kRun];
   for (int64_t begin = 0; begin < count; begin += kRun) {
     const int64_t run = std::min(kRun, count - begin);
@@ -23,7 +23,7 @@ void look_up(const T* __restrict depth, int64_t count, const T* edges, const T* 
     }
     const int32_t invalid = static_cast<int32_t>(levels);
     for (int64_t i = 0; i < run; ++i) {
-      level[i] = (z[i] > 0) & (z[i] <= largest) ? level[i] : invalid;
+      level[i] = is_valid_depth(z[i]) ? level[i] : invalid;
     }
     for (int64_t i = 0; i < run; ++i) out[begin + i] = values[level[i]];
   }

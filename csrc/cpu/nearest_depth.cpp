@@ -4,13 +4,10 @@
 #include <limits>
 #include <vector>
 
+#include "valid_depth.h"
+
 namespace surfconv::cpu {
 namespace {
-
-template <class T>
-bool is_valid(T depth) {
-  return depth > 0 && depth <= std::numeric_limits<T>::max();
-}
 
 struct Footprint {
   int64_t first, size;
@@ -29,7 +26,7 @@ int64_t search(const T* corner, int64_t columns, int64_t tall, int64_t wide) {
     for (int64_t x = 0; x < wide; ++x) {
       const int64_t distance = y * y + x * x;
       if (distance >= least) break;
-      if (is_valid(corner[y * columns + x])) {
+      if (is_valid_depth(corner[y * columns + x])) {
         least = distance;
         nearest = y * columns + x;
         break;
@@ -53,7 +50,7 @@ void search_rows(const T* depth, const Resizing& sizes, int64_t begin, int64_t e
     for (int64_t j = 0; j < sizes.width; ++j) {
       const Footprint& across = aside[static_cast<size_t>(j)];
       const int64_t first = start + across.first;
-      to[j] = is_valid(depth[first])
+      to[j] = is_valid_depth(depth[first])
                   ? first
                   : first + search(depth + first, sizes.columns, down.size, across.size);
     }

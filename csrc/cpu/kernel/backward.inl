@@ -101,17 +101,14 @@ class Backward {
       const int64_t step = elements * static_cast<int64_t>(sizeof(T));
       const int64_t before = slot.own.begin - slot.reach.begin;
       const int64_t spill = byte_distance(image, next);
-      slot.places = {slot.own.begin,
-                     slot.own.end,
-                     slot.reach.begin,
-                     slot.reach.end,
-                     step,
-                     spill - slot.reach.begin * step,
-                     -pass.in.begin * step,
-                     spill + (before - slot.own.end) * step,
-                     0,
-                     false,
-                     slot.far};
+      RowPlaces& places = slot.places;
+      places.begin = slot.own.begin, places.end = slot.own.end;
+      places.reach_begin = slot.reach.begin, places.reach_end = slot.reach.end;
+      places.step = step;
+      places.before = spill - slot.reach.begin * step;
+      places.own = -pass.in.begin * step;
+      places.after = spill + (before - slot.own.end) * step;
+      places.limited = slot.far;
       next += slot.spilled() * elements;
     }
   }
@@ -167,7 +164,7 @@ class Backward {
     }
   }
 
-  // All tiles of an image of the pass; with places that are far, the tiles that reach there.
+  // All tiles of an image of the pass; or only those that reach further than their slot.
   void run_tiles(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
                  int64_t image, int64_t unit, typename BackwardTile<T>::Target target,
                  RowPlaces places) {
@@ -183,7 +180,7 @@ class Backward {
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
     for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += kTile) {
       const int64_t count = std::min<int64_t>(kTile, end - begin);
-      if (places.far && !is_far(slot, n, begin, count)) continue;
+      if (places.only_further && !is_far(slot, n, begin, count)) continue;
       tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(pass, n), n,
                 begin, static_cast<int>(count), steps_y, steps_x);
     }
@@ -209,7 +206,7 @@ class Backward {
       for (const Slot& slot : slots) {
         if (!slot.far) continue;
         RowPlaces places = slot.places;
-        places.far = true;
+        places.only_further = true;
         run_tiles(scratch[static_cast<size_t>(worker)], pass, slot, slot.first_image, unit, {},
                   places);
       }

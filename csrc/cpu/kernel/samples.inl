@@ -31,14 +31,14 @@ struct AxisTable {
 
 // Where rows of the gradient lie, in bytes from the image's first row of the pass. A task has its
 // own rows in place, and the ones before and after them apart, as far as it reaches; what taps send
-// further is added when all tasks are done: `far` then, when nothing else is.
+// further is added when all tasks are done, and nothing else then.
 struct RowPlaces {
   int64_t begin = 0, end = 0;              // own rows
   int64_t reach_begin = 0, reach_end = 0;  // with the rows apart
   int64_t step = 0;
   int64_t before = 0, own = 0, after = 0;  // where row 0 would be in each
   int64_t nowhere = 0;                     // a row that nobody reads
-  bool far = false;
+  bool only_further = false;
   bool limited = false;  // some rows are sent to nowhere: comparisons that cost the others time
 
   int64_t reached(int64_t row) const {
@@ -46,7 +46,7 @@ struct RowPlaces {
   }
   int64_t operator()(int64_t row) const {
     const bool in_reach = (row >= reach_begin) & (row < reach_end);
-    return in_reach == far ? nowhere : (far ? row * step + own : reached(row));
+    return in_reach == only_further ? nowhere : (only_further ? row * step + own : reached(row));
   }
 };
 

@@ -36,7 +36,6 @@ class Tile {
   SURFCONV_INLINE void for_runs(const Body& body) const {
     for (int i = 0; i < run_count_; ++i) body(runs_[i]);
   }
-  bool all(Place place) const { return run_count_ == 1 && runs_[0].place == place; }
   bool has(Place place) const {
     for (int i = 0; i < run_count_; ++i) {
       if (runs_[i].place == place) return true;
