@@ -13,6 +13,7 @@ from typing import Any
 
 import torch
 
+import instructions
 import surfconv_ops
 from frames import source
 
@@ -109,6 +110,7 @@ def describe(threads: tuple[int, ...]) -> dict[str, Any]:
         "torch_cpu_capability": torch.backends.cpu.get_cpu_capability(),
         "surfconv_ops": surfconv_ops.__version__,
         "surfconv_cpu_capability": capability,
+        "instructions_held_to": instructions.held_to(),
         "commit": _commit(),
         "command": " ".join(["python", "benchmarks/run.py", *sys.argv[1:]]),
         "depth": source(),

@@ -4,6 +4,7 @@
     python benchmarks/run.py --quick                  under 1 minute, rough
     python benchmarks/run.py --suites layers net      some of it
     python benchmarks/run.py --compare old.json       and what changed since
+    python benchmarks/run.py --instructions avx2      as on a processor without AVX-512
     python benchmarks/run.py --device cuda            on a GPU, suites of its own: about 6 minutes
 
 First a gate checks correctness at the timed shapes; if it fails, nothing is timed and the exit
@@ -29,6 +30,7 @@ import compare
 import devices
 import document
 import gate_device
+import instructions
 import machine
 import peers
 from devices import Device
@@ -86,6 +88,9 @@ def parse_arguments(arguments: list[str] | None = None) -> argparse.Namespace:
     add("--threads", type=count, nargs="+", metavar="N",
         default=list(range(1, min(cores, DEFAULT_THREADS) + 1)),
         help="CPU thread counts; single runs use the first (default: %(default)s)")  # fmt: skip
+    add("--instructions", choices=list(instructions.VARIABLES),
+        help="hold torch, its libraries and the kernels to this instruction set (default: what "
+        "the processor has)")  # fmt: skip
     add("--device", choices=["cpu", "cuda"], default="cpu",
         help="where to measure; cuda is the current GPU (default: %(default)s)")  # fmt: skip
     add("--suites", nargs="+", choices=[*SUITES, *DEVICE_SUITES], metavar="NAME",
@@ -197,6 +202,8 @@ def main(arguments: list[str] | None = None) -> int:
     """The program; returns its exit status."""
     start = time.perf_counter()
     chosen = parse_arguments(arguments)
+    if chosen.instructions not in {None, instructions.held_to()}:
+        return instructions.start_again(chosen.instructions)
     try:
         old = _old(chosen.compare)
     except ValueError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ import candidates
 import cases
 import frames
 import gate
+import instructions
 import net
 import peers
 import points
@@ -141,3 +143,34 @@ print(first, sorted(faults() for _ in range(101))[50])
         pytest.skip(f"allocator: {kind}")
     first, usual = map(int, counts.split())
     assert usual < first / 10
+
+
+def test_a_run_is_held_to_an_instruction_set() -> None:
+    code = """
+import torch, surfconv_ops, instructions
+print(torch.backends.cpu.get_cpu_capability(), torch.ops.surfconv.cpu_capability(),
+      instructions.held_to())
+"""
+    folder = Path(instructions.__file__).parent
+    held = instructions.environment("avx2")
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, env=held, check=True,
+                          timeout=120, capture_output=True, text=True)  # fmt: skip
+    if "AVX2" not in torch.backends.cpu.get_cpu_capability().replace("AVX512", "AVX2"):
+        pytest.skip("a processor without AVX2")
+    assert done.stdout.split() == ["AVX2", "avx2", "avx2"]
+
+
+def test_the_same_command_starts_again() -> None:
+    """With its own arguments, held to what was asked for."""
+    code = """
+import sys, instructions
+if instructions.held_to() == "nothing":
+    raise SystemExit(instructions.start_again("avx2"))
+print(sys.argv[1:])
+raise SystemExit(3)
+"""
+    folder = Path(instructions.__file__).parent
+    plain = {k: v for k, v in os.environ.items() if k not in instructions.VARIABLES["avx2"]}
+    done = subprocess.run([sys.executable, "-c", code, "--quick", "a b"], cwd=folder, env=plain,
+                          timeout=120, capture_output=True, text=True)  # fmt: skip
+    assert (done.returncode, done.stdout) == (3, "['--quick', 'a b']\n")

@@ -130,10 +130,16 @@ def test_maximum_of_dilated_taps_at_scale_one_only_leaves_out() -> None:
     assert out[0] == 2.0 and out[1] == 9.0
 
 
-@each_mode
-def test_gradient_of_the_scale_on_pixels_is_one_sided(mode: str) -> None:
+@pytest.mark.parametrize(("mode", "options"), [("max", {}), ("avg", {}),
+                                               ("avg", {"count_include_pad": False})])  # fmt: skip
+@pytest.mark.parametrize("kernel", [3, 2])
+@pytest.mark.parametrize("axes", [1, 2])
+def test_gradient_of_the_scale_on_pixels_is_one_sided(
+    mode: str, options: dict[str, Any], kernel: int, axes: int
+) -> None:
     for scale in ("ones", "integers"):
-        problem = make(mode, 1, 1, dtype=torch.float64, scale=scale, axes=2, stride=1)
+        problem = make(mode, 1, 1, dtype=torch.float64, scale=scale, axes=axes, stride=1,
+                       kernel=kernel, **options)  # fmt: skip
         if mode == "max":
             # At 0 and right beside 1 the winner changes with the scale.
             problem.scale += 2

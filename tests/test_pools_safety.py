@@ -119,6 +119,21 @@ def test_pixels_that_no_tap_sees_do_not_leak(mode: str, bad: float) -> None:
             assert_same_bits(after["scale"], before["scale"])
 
 
+@each_mode
+@pytest.mark.parametrize("bad", [INF, NAN])
+def test_on_the_grid_nothing_leaks_from_across_a_corner(mode: str, bad: float) -> None:
+    """A growing scale moves a tap that lies on a pixel along its edges, for now."""
+    problem = make(mode, 1, 5, (16, 18), kernel=3, stride=5, padding=1, scale="ones")
+    grad = torch.randn_like(problem.run())
+    before = problem.gradients(grad)
+    dirty = replace(problem, input=problem.input.clone())
+    across = torch.tensor([2, 3, 7, 8, 12, 13])  # two pixels from the centres, which are 5 apart
+    dirty.input[..., across[:, None], across] = bad
+    after = dirty.gradients(grad)
+    assert_same_bits(after["input"], before["input"])
+    assert_same_bits(after["scale"], before["scale"])
+
+
 @pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
 def test_gradients_that_are_not_finite_stay_where_they_belong(layout: str) -> None:
     for mode in MODES:

@@ -24,6 +24,8 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "pointwise_backward.inl"
 #include "backward_tile.inl"
 #include "backward.inl"
+#include "pool_axis.inl"
+#include "pool_corners.inl"
 #include "pool_samples.inl"
 #include "pool_images.inl"
 #include "pool_forward.inl"

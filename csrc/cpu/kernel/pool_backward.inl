@@ -37,13 +37,14 @@ void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const
   const int workers = workers_for(executor, pool.batch * blocks,
                                   pool.batch * outputs * pool.channels * pool.taps());
   const int64_t image_size = direct ? 0 : inputs * padded;
-  const int64_t scratch = PoolSampler<E, T>::need(pool) + Workspace::need<T>(kTile * padded) +
-                          Workspace::need<T>(image_size) + Workspace::need<uint32_t>(padded);
+  const int64_t scratch = PoolSampler<E, Slopes::none, T>::need(pool) +
+                          Workspace::need<T>(kTile * padded) + Workspace::need<T>(image_size) +
+                          Workspace::need<uint32_t>(padded);
   PoolImages<T> images(pool, {}, tensors.guide);
   images.for_groups(executor, [&](int64_t first_image, int64_t count) {
     run_tasks(executor, count * blocks, workers, [&](int, int64_t task) {
       Workspace memory(scratch);
-      PoolSampler<E, T> sampler(pool, step_y, step_x, memory);
+      PoolSampler<E, Slopes::none, T> sampler(pool, step_y, step_x, memory);
       uint32_t* numbers = memory.take<uint32_t>(padded);
       T* grads = memory.take<T>(kTile * padded);
       T* image = memory.take<T>(image_size);
@@ -52,8 +53,10 @@ void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const
       if (direct) {
         image = static_cast<T*>(target.data) + n * target.n + first_channel;
         for (int64_t y = 0; y < pool.y.in; ++y) {
-          for (int64_t x = 0; x < pool.x.in; ++x) {
-            std::fill_n(image + y * step_y + x * step_x, channels, T(0));
+          const int64_t pixels = step_x == channels ? 1 : pool.x.in;
+          const int64_t run = step_x == channels ? pool.x.in * channels : channels;
+          for (int64_t x = 0; x < pixels; ++x) {
+            std::fill_n(image + y * step_y + x * step_x, run, T(0));
           }
         }
       } else {
@@ -65,7 +68,7 @@ void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const
         load_pixels<T>(tensors.grad_output, n, first_channel, channels, pool.x.out, first, pixels,
                        grads, padded, padded);
         for (int64_t m = 0; m < pixels; ++m) {
-          sampler.template list<false>(m);
+          sampler.list(m);
           body(sampler, numbers, m, n * outputs + first + m, first_channel, channels,
                grads + m * padded, image);
         }
@@ -79,17 +82,17 @@ void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const
 
 // body(sampler, room for a row of winners, image, pixel of the tile, flat output pixel with n,
 // gradient of its channels) gives the gradient of (scale_y, scale_x).
-template <Edges E, class T, class Body>
+template <Edges E, Slopes S, class T, class Body>
 void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const Executor& executor,
                      const Body& body) {
   const int64_t outputs = pool.y.out * pool.x.out, padded = to_quads(pool.channels);
   PoolImages<T> images(pool, tensors.input, tensors.guide);
   const int workers = workers_for(executor, pool.batch * pool_tiles(pool),
                                   pool.batch * outputs * padded * pool.taps());
-  const int64_t scratch = PoolSampler<E, T>::need(pool) + Workspace::need<T>(kTile * padded) +
+  const int64_t scratch = PoolSampler<E, S, T>::need(pool) + Workspace::need<T>(kTile * padded) +
                           Workspace::need<uint32_t>(padded);
   std::vector<Workspace> memory;
-  std::vector<PoolSampler<E, T>> samplers;
+  std::vector<PoolSampler<E, S, T>> samplers;
   std::vector<T*> rows;
   std::vector<uint32_t*> numbers;
   for (int worker = 0; worker < workers; ++worker) {
@@ -109,19 +112,26 @@ void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const
                          padded, padded);
           T along_y[kTile], along_x[kTile];
           for (int64_t m = 0; m < pixels; ++m) {
-            sampler.template list<true>(m);
+            sampler.list(m);
             const ScaleGradient<T> grad =
                 body(sampler, numbers[static_cast<size_t>(worker)], images.image(n), m,
                      n * outputs + first + m, grads + m * padded);
-            along_y[m] = pool.scale_components == 1 ? grad.y + grad.x : grad.y;
+            along_y[m] = grad.y;
             along_x[m] = grad.x;
           }
           store_pixels<T>(tensors.grad_scale, n, 0, 1, pool.x.out, first, pixels, along_y, 1);
-          if (pool.scale_components == 2) {
+          if (S == Slopes::two) {
             store_pixels<T>(tensors.grad_scale, n, 1, 1, pool.x.out, first, pixels, along_x, 1);
           }
         });
   });
+}
+
+// Calls body(which slopes, as a constant).
+template <class Body>
+void with_slopes(const Pool& pool, const Body& body) {
+  if (pool.scale_components == 1) return body(std::integral_constant<Slopes, Slopes::one>{});
+  body(std::integral_constant<Slopes, Slopes::two>{});
 }
 
 template <class T>
@@ -142,17 +152,20 @@ void max_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
           });
     }
     if (tensors.grad_scale.data == nullptr) return;
-    pool_grad_scale<Edges::clamp, T>(
-        pool, tensors, executor,
-        [&](const auto& sampler, uint32_t* numbers, const T* image, int64_t, int64_t pixel,
-            const T* grad) {
-          ScaleGradient<T> along;
-          with_whole_quads(
-              winners + pixel * pool.channels, pool.channels, numbers, [&](const auto* row) {
-                along = slopes_of_winners(sampler.corners, taps, padded, grad, row, image);
-              });
-          return along;
-        });
+    with_slopes(pool, [&](auto slopes) {
+      constexpr Slopes S = decltype(slopes)::value;
+      pool_grad_scale<Edges::clamp, S, T>(
+          pool, tensors, executor,
+          [&](const auto& sampler, uint32_t* numbers, const T* image, int64_t, int64_t pixel,
+              const T* grad) {
+            ScaleGradient<T> along;
+            with_whole_quads(
+                winners + pixel * pool.channels, pool.channels, numbers, [&](const auto* row) {
+                  along = slopes_of_winners<S>(sampler.corners, taps, padded, grad, row, image);
+                });
+            return along;
+          });
+    });
   });
 }
 
@@ -170,33 +183,15 @@ void avg_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
   }
   if (tensors.grad_scale.data == nullptr) return;
   const bool weighted = pool.divisor_override == 0 && !pool.count_include_pad;
-  pool_grad_scale<Edges::zero, T>(
-      pool, tensors, executor,
-      [&](const auto& sampler, uint32_t*, const T* image, int64_t m, int64_t, const T* grad) {
-        const PoolCorners<T>& corners = sampler.corners;
-        const T divisor = sampler.divisor(m);
-        if (divisor == 0) return ScaleGradient<T>{};
-        const auto product = [&](int64_t q) {
-          return static_cast<double>(channel_product(padded, grad, image + corners.offset[q]));
-        };
-        // Where the weights make up the divisor, the mean comes off each corner's value.
-        double mean = 0;
-        if (weighted) {
-          for (int64_t q = 0; q < corners.count; ++q) {
-            if (corners.weight[q] != 0) mean += static_cast<double>(corners.weight[q]) * product(q);
-          }
-          mean /= static_cast<double>(divisor);
-        }
-        double along_y = 0, along_x = 0;
-        for (int64_t q = 0; q < corners.count; ++q) {
-          if (corners.slope_y[q] == 0 && corners.slope_x[q] == 0) continue;
-          const double value = product(q) - mean;
-          along_y += static_cast<double>(corners.slope_y[q]) * value;
-          along_x += static_cast<double>(corners.slope_x[q]) * value;
-        }
-        return ScaleGradient<T>{static_cast<T>(along_y / static_cast<double>(divisor)),
-                                static_cast<T>(along_x / static_cast<double>(divisor))};
-      });
+  with_slopes(pool, [&](auto slopes) {
+    constexpr Slopes S = decltype(slopes)::value;
+    pool_grad_scale<Edges::zero, S, T>(
+        pool, tensors, executor,
+        [&](const auto& sampler, uint32_t*, const T* image, int64_t m, int64_t, const T* grad) {
+          return slopes_of_average<S>(sampler.corners, weighted, sampler.divisor(m), padded, grad,
+                                      image);
+        });
+  });
 }
 
 inline void max_pool_backward(const Pool& pool, const PoolBackwardTensors& tensors,

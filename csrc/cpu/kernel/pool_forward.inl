@@ -20,6 +20,7 @@ SURFCONV_INLINE void max_of_taps(const T* image, const PoolCorners<T>& corners, 
     best[i] = broadcast<V>(-std::numeric_limits<T>::infinity());
     winner[i] = Mask{} + static_cast<Number>(fallback);
   }
+  const int64_t step = corners.step;
   for (int64_t t = 0; t < taps; ++t) {
     const int32_t begin = Each != 0 ? static_cast<int32_t>(t) * Each : corners.first[t];
     const int32_t end = Each != 0 ? begin + Each : corners.first[t + 1];
@@ -27,12 +28,14 @@ SURFCONV_INLINE void max_of_taps(const T* image, const PoolCorners<T>& corners, 
     V value[Vectors];
 #pragma GCC unroll 4
     for (int i = 0; i < Vectors; ++i) {
-      value[i] = corners.weight[begin] * load<V>(image + corners.offset[begin] + i * Lanes);
+      value[i] =
+          corners.weight[begin * step] * load<V>(image + corners.offset[begin * step] + i * Lanes);
     }
     for (int32_t q = begin + 1; q < end; ++q) {
 #pragma GCC unroll 4
       for (int i = 0; i < Vectors; ++i) {
-        value[i] += corners.weight[q] * load<V>(image + corners.offset[q] + i * Lanes);
+        value[i] +=
+            corners.weight[q * step] * load<V>(image + corners.offset[q * step] + i * Lanes);
       }
     }
 #pragma GCC unroll 4
@@ -75,8 +78,8 @@ SURFCONV_INLINE void sum_of_corners(const T* image, const PoolCorners<T>& corner
   using V = Vec<T, Lanes>;
   V sum[Vectors] = {};
   for (int64_t q = 0; q < corners.count; ++q) {
-    const T* pixel = image + corners.offset[q];
-    const T weight = corners.weight[q];
+    const T* pixel = image + corners.offset[q * corners.step];
+    const T weight = corners.weight[q * corners.step];
 #pragma GCC unroll 4
     for (int i = 0; i < Vectors; ++i) sum[i] += weight * load<V>(pixel + i * Lanes);
   }
@@ -107,9 +110,10 @@ void pool_forward(const Pool& pool, const PoolForwardTensors& tensors, const Exe
   PoolImages<T> images(pool, tensors.input, tensors.guide);
   const int workers = workers_for(executor, pool.batch * pool_tiles(pool),
                                   pool.batch * outputs * padded * pool.taps());
-  const int64_t scratch = PoolSampler<E, T>::need(pool) + Workspace::need<T>(kTile * padded);
+  const int64_t scratch =
+      PoolSampler<E, Slopes::none, T>::need(pool) + Workspace::need<T>(kTile * padded);
   std::vector<Workspace> memory;
-  std::vector<PoolSampler<E, T>> samplers;
+  std::vector<PoolSampler<E, Slopes::none, T>> samplers;
   std::vector<T*> stages;
   for (int worker = 0; worker < workers; ++worker) {
     memory.emplace_back(scratch);
@@ -128,7 +132,7 @@ void pool_forward(const Pool& pool, const PoolForwardTensors& tensors, const Exe
             T* to = direct
                         ? static_cast<T*>(output.data) + n * output.n + y * output.y + x * output.x
                         : stage + m * padded;
-            sampler.template list<false>(m);
+            sampler.list(m);
             body(sampler, images.image(n), m, n * outputs + first + m, to);
           }
           if (!direct) {

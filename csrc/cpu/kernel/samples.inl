@@ -7,6 +7,11 @@ constexpr int kTile = 48;
 constexpr int64_t kMostTaps = 64;
 SURFCONV_INLINE bool has_whole_rows(const Conv& conv) { return conv.x.kernel <= kMostTaps; }
 
+// Whether 32 bits hold all positions: then there are as many in a vector as floats.
+SURFCONV_INLINE bool has_narrow_reach(const Axis& y, const Axis& x) {
+  return std::max(y.reach(), x.reach()) < (int64_t{1} << 28);
+}
+
 // Per axis, tap and side (pixel `lo`, then `lo + 1`), one entry for each pixel of the tile.
 template <class T>
 struct AxisTable {

@@ -17,7 +17,7 @@ class Tile {
     return AxisTable<T>::need(conv.y) + AxisTable<T>::need(conv.x) + CornerTable<T>::need(taps);
   }
   Tile(const Conv& conv, int64_t taps, Workspace& memory)
-      : conv_(conv), narrow_(std::max(conv.y.reach(), conv.x.reach()) < (int64_t{1} << 28)) {
+      : conv_(conv), narrow_(has_narrow_reach(conv.y, conv.x)) {
     rows_.take(conv.y, memory);
     columns_.take(conv.x, memory);
     corners_.take(taps, memory);

@@ -116,9 +116,17 @@ SURFCONV_INLINE void for_channels(int64_t channels, const Body& body) {
   }
 }
 
+// Halves by halves: lane by lane each addition would wait for the one before it.
 template <class T, class V>
 SURFCONV_INLINE T sum_lanes(V v) {
-  T total = 0;
-  for (int i = 0; i < static_cast<int>(sizeof(V) / sizeof(T)); ++i) total += v[i];
-  return total;
+  constexpr int lanes = static_cast<int>(sizeof(V) / sizeof(T));
+  if constexpr (lanes == 1) {
+    return v[0];
+  } else {
+    using Half = Vec<T, lanes / 2>;
+    Half lower, upper;
+    __builtin_memcpy(&lower, &v, sizeof(Half));
+    __builtin_memcpy(&upper, reinterpret_cast<const char*>(&v) + sizeof(Half), sizeof(Half));
+    return sum_lanes<T>(Half(lower + upper));
+  }
 }
