@@ -48,7 +48,7 @@ class Backward {
       };
       const Pass* previous = i > 0 ? same_image(i - 1) : nullptr;
       input_.pack(pass, executor_);
-      guide_.pack(pass);
+      guide_.pack(pass.first_image, pass.images, executor_);
       grad_input_.begin(pass, previous, executor_);
       lay_out_spill(pass, slots[i]);
       run_slots(pass, slots[i]);
@@ -181,7 +181,7 @@ class Backward {
     for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += kTile) {
       const int64_t count = std::min<int64_t>(kTile, end - begin);
       if (places.only_further && !is_far(slot, n, begin, count)) continue;
-      tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(pass, n), n,
+      tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(n), n,
                 begin, static_cast<int>(count), steps_y, steps_x);
     }
   }

@@ -47,7 +47,7 @@ class Forward {
     }
     for (const Pass& pass : passes) {
       input_.pack(pass, executor_);
-      guide_.pack(pass);
+      guide_.pack(pass.first_image, pass.images, executor_);
       const int64_t first = pass.out.begin * conv_.x.out;
       const int64_t pixels = pass.out.count() * conv_.x.out, tiles = (pixels + kTile - 1) / kTile;
       run_tasks(executor_, pass.images * tiles, workers, [&](int worker, int64_t task) {
@@ -115,7 +115,7 @@ class Forward {
     const int64_t unseen = byte_distance(base, unseen_.data());
     const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in};
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
-    scratch.tile.place(tensors_.scale, guide_.image(pass, n), n, begin, count, steps_y, steps_x);
+    scratch.tile.place(tensors_.scale, guide_.image(n), n, begin, count, steps_y, steps_x);
     // Straight into the output where whole blocks of the product fit there.
     const bool direct = writes_rows_ && (fused_ || count % kRowPad == 0);
     const int64_t ld_out = direct ? tensors_.output.x : plan_.groups * width_;

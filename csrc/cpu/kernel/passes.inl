@@ -159,37 +159,3 @@ class InputRows {
   const bool packed_;
   Buffer<T> memory_;
 };
-
-// The guide in the compute type, one value a pixel, whole images.
-template <class T>
-class GuideRows {
- public:
-  GuideRows(const Conv& conv, const View& guide)
-      : conv_(conv),
-        guide_(guide),
-        packed_(guide.data != nullptr &&
-                !(guide.dtype == kComputeDType<T> && guide.x == 1 && guide.y == conv.x.in)) {}
-
-  void pack(const Pass& pass) {
-    const int64_t pixels = conv_.y.in * conv_.x.in;
-    if (!packed_ || (packed_image_ == pass.first_image && memory_)) return;
-    memory_ = Buffer<T>(pass.images * pixels);
-    packed_image_ = pass.first_image;
-    for (int64_t n = 0; n < pass.images; ++n) {
-      load_pixels<T>(guide_, pass.first_image + n, 0, 1, conv_.x.in, 0, pixels,
-                     memory_.get() + n * pixels, 1, 1);
-    }
-  }
-  const T* image(const Pass& pass, int64_t n) const {
-    if (guide_.data == nullptr) return nullptr;
-    return packed_ ? memory_.get() + (n - pass.first_image) * conv_.y.in * conv_.x.in
-                   : static_cast<const T*>(guide_.data) + n * guide_.n;
-  }
-
- private:
-  const Conv& conv_;
-  const View& guide_;
-  const bool packed_;
-  int64_t packed_image_ = -1;
-  Buffer<T> memory_;
-};

@@ -177,6 +177,7 @@ struct GuideTile {
   T tolerance = 0;
   T centre[kTile] = {};
   T exempt[kTile] = {};  // 1 where the centre's own value is not finite: all corners are visible
+  int32_t all_seen[kTile] = {};  // 1 where every corner is known to be visible
 };
 
 // Corners of one tap: 1, 2 or 4 of them, [corner][kTile]. A corner of zero weight is never seen:

@@ -44,9 +44,9 @@ class Tile {
   }
 
   // Flat output pixels first .. first+count-1 of image n.
-  void place(const View& scale, const T* guide, int64_t n, int64_t first, int count,
+  void place(const View& scale, const GuideImage<T>& guide, int64_t n, int64_t first, int count,
              AxisSteps steps_y, AxisSteps steps_x) {
-    if (guide == nullptr) steps_y.pixel = steps_x.pixel = 0;
+    if (guide.value == nullptr) steps_y.pixel = steps_x.pixel = 0;
     T scale_y[kTile] = {}, scale_x_own[kTile] = {};
     load_pixels<T>(scale, n, 0, 1, conv_.x.out, first, count, scale_y, 1, 1);
     const T* scale_x = scale_y;
@@ -54,9 +54,9 @@ class Tile {
       load_pixels<T>(scale, n, 1, 1, conv_.x.out, first, count, scale_x_own, 1, 1);
       scale_x = scale_x_own;
     }
-    guide_.image = guide;
+    guide_.image = guide.value;
     guide_.tolerance = static_cast<T>(conv_.guide_tolerance);
-    if (guide != nullptr) read_guide(guide, first, count);
+    if (guide.value != nullptr) read_guide(guide, scale_y, scale_x, first, count);
     WeightBounds<T> bounds;
     std::fill_n(bounds.lowest, kTile, T(1));
     std::fill_n(bounds.nearest, kTile, T(1));
@@ -119,24 +119,45 @@ class Tile {
     std::fill(centre_x + count, centre_x + kTile, Int(0));
   }
 
-  void read_guide(const T* guide, int64_t first, int count) {
+  void read_guide(const GuideImage<T>& guide, const T* scale_y, const T* scale_x, int64_t first,
+                  int count) {
+    int32_t open[kTile] = {};
     for_rows(first, count, [&](int done, int run, int64_t y, int64_t x) {
-      const T* row = guide + conv_.y.centre_pixel(y) * conv_.x.in;
+      const int64_t row = conv_.y.centre_pixel(y) * conv_.x.in;
       for (int m = 0; m < run; ++m) {
-        const T value = row[conv_.x.centre_pixel(x + m)];
+        const int64_t pixel = row + conv_.x.centre_pixel(x + m);
+        const T value = guide.value[pixel];
         guide_.centre[done + m] = value;
         guide_.exempt[done + m] = value - value == 0 ? T(0) : T(1);
+        if (guide.open != nullptr) open[done + m] = guide.open[pixel];
       }
     });
+    // With some to spare for what rounding makes of a position.
+    const T spare = T(1) + T(1e-5), outermost = static_cast<T>(outermost_tap(conv_));
+    const T tap_y = static_cast<T>(std::abs(conv_.y.tap_doubled(0))) / 2 * spare;
+    const T tap_x = static_cast<T>(std::abs(conv_.x.tap_doubled(0))) / 2 * spare;
+    const T half_y = conv_.y.centre_is_half() ? T(0.5) : T(0);
+    const T half_x = conv_.x.centre_is_half() ? T(0.5) : T(0);
+    for (int m = 0; m < kTile; ++m) {
+      const T reach_y = std::fabs(scale_y[m]) * tap_y + half_y;
+      const T reach_x = std::fabs(scale_x[m]) * tap_x + half_x;
+      int32_t beyond = 0;
+      for (int i = 0; i < kReaches; ++i) {
+        const T limit = outermost * static_cast<T>(1 << i);
+        beyond += (reach_y >= limit) | (reach_x >= limit);
+      }
+      guide_.all_seen[m] = (guide_.exempt[m] != 0) | (open[m] > beyond);
+    }
   }
 
   void find_runs(const WeightBounds<T>& bounds, int count) {
     static_assert(kTile < 64, "a bit for each pixel and the end");
     const bool possible = has_whole_rows(conv_), guided = guide_.image != nullptr;
-    if (possible && !guided) {
-      int interior = 0;
-      for (int m = 0; m < kTile; ++m) interior += bounds.lowest[m] > 0;
-      if (interior == kTile) {
+    const auto unseen = [&](int m) { return guided ? guide_.all_seen[m] == 0 : false; };
+    if (possible) {
+      int inside = 0;
+      for (int m = 0; m < kTile; ++m) inside += (bounds.lowest[m] > 0) & !unseen(m);
+      if (inside == kTile) {
         runs_[0] = {0, count, Place::interior};
         run_count_ = 1;
         return;
@@ -144,9 +165,8 @@ class Tile {
     }
     int32_t place[kTile];
     for (int m = 0; m < kTile; ++m) {
-      const int32_t unseen = guided ? guide_.exempt[m] == 0 : 0;
       const int32_t apart = bounds.lowest[m] <= 0, off_grid = bounds.nearest[m] < 1;
-      place[m] = (apart + (apart & off_grid)) | (unseen << 1);
+      place[m] = (apart + (apart & off_grid)) | (static_cast<int32_t>(unseen(m)) << 1);
     }
     uint64_t changes = uint64_t{1} << count;
     for (int m = 1; m < count; ++m) changes |= static_cast<uint64_t>(place[m] != place[m - 1]) << m;
