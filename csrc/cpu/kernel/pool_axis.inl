@@ -23,8 +23,8 @@ struct PoolAxis {
 template <class T>
 struct PoolBounds {
   T between[kTile];  // of their weights the least: positive where every tap lies between pixels
-  T on_grid[kTile];  // of the weights on each tap's side towards the centre the least: 1 where every
-                     // tap lies on a pixel
+  T on_grid[kTile];  // of the weights on each tap's side towards the centre the least: 1 where
+                     // every tap lies on a pixel
   T inside[kTile];   // 1 where both sides of every tap are in the image, else 0
 };
 
