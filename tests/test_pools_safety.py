@@ -119,6 +119,17 @@ def test_pixels_that_no_tap_sees_do_not_leak(mode: str, bad: float) -> None:
             assert_same_bits(after["scale"], before["scale"])
 
 
+@pytest.mark.parametrize("bad", [INF, NAN])
+def test_a_tap_that_does_not_move_adds_nothing_to_the_gradient_of_the_scale(bad: float) -> None:
+    problem = make("avg", 1, 5, (16, 19), kernel=3, stride=3, padding=1, scale="ones")
+    problem.scale.fill_(1.3)
+    grad = torch.randn_like(problem.run())
+    before = problem.gradients(grad)["scale"]
+    dirty = replace(problem, input=problem.input.clone())
+    dirty.input[..., ::3, ::3] = bad  # the centres
+    assert_same_bits(dirty.gradients(grad)["scale"], before)
+
+
 @each_mode
 @pytest.mark.parametrize("bad", [INF, NAN])
 def test_on_the_grid_nothing_leaks_from_across_a_corner(mode: str, bad: float) -> None:
