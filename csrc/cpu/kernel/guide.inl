@@ -17,11 +17,8 @@ inline int64_t outermost_tap(const Conv& conv) {
 
 // Part of an image.
 struct Patch {
-  struct Range {
-    int64_t begin, end;
-    int64_t count() const { return end - begin; }
-  };
-  Range y, x;
+  int64_t y, x;  // first pixel
+  int64_t rows, columns;
 };
 
 // Least and greatest values of squares around the pixels of a patch. What lies outside the image
@@ -49,11 +46,11 @@ class Extremes {
     constexpr T infinity = std::numeric_limits<T>::infinity();
     std::fill_n(low_, rows_ * step_, infinity);
     std::fill_n(high_, rows_ * step_, -infinity);
-    const int64_t begin = std::max<int64_t>(patch.x.begin - margin_, 0);
-    const int64_t count = std::min(patch.x.end + margin_, image_width) - begin;
-    const int64_t shift = begin - (patch.x.begin - margin_);
+    const int64_t begin = std::max<int64_t>(patch.x - margin_, 0);
+    const int64_t count = std::min(patch.x + patch.columns + margin_, image_width) - begin;
+    const int64_t shift = begin - (patch.x - margin_);
     for (int64_t row = 0; row < rows_; ++row) {
-      const int64_t y = patch.y.begin - margin_ + row;
+      const int64_t y = patch.y - margin_ + row;
       if (y < 0 || y >= image_rows) continue;
       const T* __restrict from = image + y * image_width + begin;
       T* __restrict low = low_ + row * step_ + shift;
@@ -144,7 +141,8 @@ class GuideRows {
     const int workers = workers_for(executor, tasks, images_ * pixels_);
     std::vector<Extremes<T>> extremes;
     for (int i = 0; i < workers; ++i) {
-      extremes.emplace_back(kRows, kColumns, outermost_ << (kReaches - 1));
+      extremes.emplace_back(std::min(kRows, height), std::min(kColumns, width),
+                            outermost_ << (kReaches - 1));
     }
     // An infinite one would let values pass that are not finite.
     const T tolerance =
@@ -152,7 +150,7 @@ class GuideRows {
     run_tasks(executor, tasks, workers, [&](int worker, int64_t task) {
       const int64_t image = task / (down * across);
       const int64_t y = task / across % down * kRows, x = task % across * kColumns;
-      const Patch patch{{y, std::min(y + kRows, height)}, {x, std::min(x + kColumns, width)}};
+      const Patch patch{y, x, std::min(kRows, height - y), std::min(kColumns, width - x)};
       const int64_t first = y * width + x;
       find_open_patch(extremes[static_cast<size_t>(worker)], values(first_image_ + image), patch,
                       tolerance, open_.get() + image * pixels_ + first);
@@ -161,16 +159,16 @@ class GuideRows {
 
   void find_open_patch(Extremes<T>& around, const T* image, const Patch& patch, T tolerance,
                        uint8_t* open) const {
-    const int64_t width = conv_.x.in, columns = patch.x.count();
+    const int64_t width = conv_.x.in;
     around.start(image, conv_.y.in, width, patch);
     for (int i = 0; i < kReaches; ++i) {
       around.widen(outermost_ << i);
-      for (int64_t row = 0; row < patch.y.count(); ++row) {
-        const T* centre = image + (patch.y.begin + row) * width + patch.x.begin;
+      for (int64_t row = 0; row < patch.rows; ++row) {
+        const T* centre = image + (patch.y + row) * width + patch.x;
         uint8_t* __restrict to = open + row * width;
         int32_t within[kColumns];
-        find_within(columns, around.low(row), around.high(row), centre, tolerance, within);
-        for (int64_t x = 0; x < columns; ++x) {
+        find_within(patch.columns, around.low(row), around.high(row), centre, tolerance, within);
+        for (int64_t x = 0; x < patch.columns; ++x) {
           to[x] = static_cast<uint8_t>((i == 0 ? 0 : to[x]) + within[x]);
         }
       }

@@ -33,10 +33,7 @@ template <Edges E, bool Descending, class T, class Int>
 void locate_pool(const Axis& axis, T half, T tap, const T* __restrict scale,
                  const Int* __restrict centre, T* __restrict weight, T* __restrict slope,
                  int64_t* __restrict pixel, PoolBounds<T>& bounds) {
-  // g++ 12 takes comparisons of longer vectors apart, lane by lane.
-  constexpr int lanes = sizeof(T) == sizeof(Int)
-                            ? std::min(SURFCONV_VECTOR_BYTES, 32) / static_cast<int>(sizeof(T))
-                            : 4;
+  constexpr int lanes = sizeof(T) == sizeof(Int) ? kComparedLanes<T> : 4;
   using Real = Vec<T, lanes>;
   using Integer = Vec<Int, lanes>;
   using Mask = decltype(Real{} > Real{});

@@ -1,9 +1,5 @@
 // The pools' forward: one output pixel at a time, over all of its channels.
 
-// g++ 12 takes comparisons of longer vectors apart, lane by lane.
-template <class T>
-constexpr int kMaxLanes = std::min(SURFCONV_VECTOR_BYTES, 32) / static_cast<int>(sizeof(T));
-
 // Vectors at a time, so that one need not wait for the other.
 constexpr int kMaxVectors = SURFCONV_VECTOR_BYTES == 64 ? 4 : 2;
 
@@ -56,7 +52,7 @@ void max_of_pixel(const T* image, const PoolCorners<T>& corners, int64_t taps, i
                   T* out, W* winners) {
   int32_t fallback = 0;  // the first tap there is
   while (corners.first[fallback] == corners.first[fallback + 1]) ++fallback;
-  constexpr int lanes = kMaxLanes<T>, step = lanes * kMaxVectors;
+  constexpr int lanes = kComparedLanes<T>, step = lanes * kMaxVectors;
   int64_t c = 0;
   for (; c + step <= channels; c += step) {
     max_of_taps<Each, lanes, kMaxVectors>(image + c, corners, taps, fallback, out + c, winners + c);

@@ -1,24 +1,23 @@
 // What one output pixel of a pool adds to the gradients.
-// Which tap has won a channel is random, and so would be branches on it: all channels by all taps.
 
 // Lanes of -1 where two numbers, neither of them negative, are equal, else 0.
 template <class V>
 SURFCONV_INLINE V equal_lanes(V a, V b) {
-  if constexpr (sizeof(V) <= 32) {
+  if constexpr (sizeof(V) <= kComparedBytes) {
     return a == b;
   } else {
-    // g++ 12 takes comparisons of long vectors apart, lane by lane.
     return ((a ^ b) - 1) >> static_cast<int>(8 * sizeof(a[0]) - 1);
   }
 }
 
-// What is not finite concerns no channel but those that it has won.
+// Zero where the mask is not set, also of what is not finite.
 template <class V, class M>
-SURFCONV_INLINE V where(M mask, V value) {
+SURFCONV_INLINE V masked(M mask, V value) {
   return (V)((M)value & mask);
 }
 
-// Calls body(channel, width, tap, which lanes it has won) for all channels and taps.
+// Calls body(channel, width, tap, which lanes it has won) for all channels and taps: which tap has
+// won a channel is random, and so would be branches on it.
 template <class T, class W, class Body>
 SURFCONV_INLINE void for_winners(const PoolCorners<T>& corners, int64_t taps, int64_t channels,
                                  const W* winners, const Body& body) {
@@ -42,7 +41,7 @@ SURFCONV_INLINE void scatter_winners(const PoolCorners<T>& corners, int64_t taps
   for_winners(corners, taps, channels, winners,
               [&](int64_t c, auto width, int64_t t, auto won) SURFCONV_INLINED {
                 using V = Vec<T, decltype(width)::lanes>;
-                const V share = where(won, load<V>(grad + c));
+                const V share = masked(won, load<V>(grad + c));
                 for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
                   T* pixel = to + corners.offset[q * corners.step] + c;
                   store(pixel, V(load<V>(pixel) + corners.weight[q * corners.step] * share));
@@ -92,8 +91,8 @@ ScaleGradient<T> slopes_of_winners(const PoolCorners<T>& corners, int64_t taps, 
                   if constexpr (S == Slopes::two) slope_x += corners.slope_x[at] * value;
                 }
                 const V outer = load<V>(grad + c);
-                slope = where(won, V(slope * outer));
-                if constexpr (S == Slopes::two) slope_x = where(won, V(slope_x * outer));
+                slope = masked(won, V(slope * outer));
+                if constexpr (S == Slopes::two) slope_x = masked(won, V(slope_x * outer));
                 if constexpr (lanes == most) {
                   sum_y += slope;
                   sum_x += slope_x;

@@ -50,7 +50,7 @@ class PoolSampler {
       fill_axes<int64_t>(scale_y, scale_x, count);
     }
     guide_ = guide;
-    if (guide != nullptr || !has_patterns_) return;
+    if (guide != nullptr) return;
     bool any_whole = false, any_on_grid = false;
     for (int64_t m = 0; m < count; ++m) {
       any_whole |= is_whole(m);
@@ -63,9 +63,9 @@ class PoolSampler {
   // Sets `corners` to those of pixel m of the tile.
   void list(int64_t m) {
     if (guide_ == nullptr) {
-      if (has_patterns_ && is_whole(m)) {
+      if (is_whole(m)) {
         corners = whole_.corners(m);
-      } else if (has_patterns_ && is_on_grid(m)) {
+      } else if (is_on_grid(m)) {
         corners = on_grid_.corners(m);
       } else {
         list_seen<false>(m);
@@ -99,9 +99,9 @@ class PoolSampler {
   }
   static int64_t listed_entries(const Pool& pool) { return pool.taps() * 4; }
 
-  bool is_whole(int64_t m) const { return bounds_.between[m] > 0; }
+  bool is_whole(int64_t m) const { return has_patterns_ & (bounds_.between[m] > 0); }
   bool is_on_grid(int64_t m) const {
-    return (bounds_.on_grid[m] == 1) & (!kSloped | (bounds_.inside[m] == 1));
+    return has_patterns_ & (bounds_.on_grid[m] == 1) & (!kSloped | (bounds_.inside[m] == 1));
   }
 
   template <class Int>

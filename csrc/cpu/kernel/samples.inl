@@ -91,9 +91,7 @@ void locate_tile(T half, T tap, Int size, const T* __restrict scale, const Int* 
                  WeightBounds<T>& bounds) {
   T* __restrict lowest = bounds.lowest;
   T* __restrict nearest = bounds.nearest;
-  // g++ 12 takes comparisons of longer vectors apart, lane by lane.
-  constexpr int most = std::min(SURFCONV_VECTOR_BYTES, 32) / static_cast<int>(sizeof(T));
-  constexpr int lanes = sizeof(T) == sizeof(Int) ? most : 1;
+  constexpr int lanes = sizeof(T) == sizeof(Int) ? kComparedLanes<T> : 1;
   using Real = Vec<T, lanes>;
   using Integer = Vec<Int, lanes>;
   using Mask = decltype(Real{} > Real{});

@@ -12,6 +12,11 @@ using Vec = typename VecOf<T, N>::type;
 template <class T>
 constexpr int kLanes = SURFCONV_VECTOR_BYTES / static_cast<int>(sizeof(T));
 
+// Lanes of vectors that are compared: g++ 12 takes comparisons of longer ones apart, lane by lane.
+constexpr int kComparedBytes = std::min(SURFCONV_VECTOR_BYTES, 32);
+template <class T>
+constexpr int kComparedLanes = kComparedBytes / static_cast<int>(sizeof(T));
+
 // Channels are stored in multiples of a quad, the narrowest vector of every instruction set in
 // float, so that no loop over channels needs a scalar tail.
 constexpr int64_t kQuad = 4;
