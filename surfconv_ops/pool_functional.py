@@ -44,9 +44,8 @@ def surf_max_pool2d(
         ceil_mode: Whether a window may reach beyond the padding, as in nn.
         scale: Factor on the tap spacing per output pixel, without unit; any value. float32 or
             the input's dtype.
-        guide: What a tap may see, as in :func:`surfconv_ops.surf_conv2d`. A sample is
-            interpolated over the pixels that are seen; a tap that sees none is left out, and
-            where no tap would be left everything is seen. Carries no gradient.
+        guide: What a tap may see, as in :func:`surfconv_ops.surf_conv2d`: what it does not see
+            counts as zero, which beats negative features. Carries no gradient.
         guide_tolerance: In the guide's unit; zero or more.
 
     Returns:
@@ -99,7 +98,7 @@ def surf_avg_pool2d(
     pixels outside the image and hidden ones count as zero, one by one. With scale 1 this is
     :func:`torch.nn.functional.avg_pool2d`. The divisor is the one that nn has for the window; with
     ``count_include_pad=False`` it is the sum of the interpolation weights that the taps have on
-    seen pixels of the image, and a divisor of 0 gives 0.
+    pixels of the image, hidden ones included, and a divisor of 0 gives 0.
 
     Derivatives of any order work, forward-mode differentiation raises.
 

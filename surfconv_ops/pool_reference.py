@@ -12,7 +12,7 @@ from torch import Tensor
 
 from . import geometry
 from .geometry import Pair
-from .pool_sampling import MaxSampler, Place, Sampler, Share
+from .pool_sampling import Place, Sampler, Share
 from .sampling import pixels, seen
 
 #: Kernels of up to this many taps have their winners counted in 8 bits; one number means none.
@@ -39,14 +39,16 @@ def max_forward(
     The winners are (N, Ho, Wo, C), and the number of taps where a window has none.
     """
     place = Place(scale, guide, guide_tolerance, kernel, stride, padding, dilation)
-    sampler = MaxSampler(input, place)
+    sampler = Sampler(input, place, clamped=True)
     none = kernel[0] * kernel[1]
     batch, channels = input.shape[:2]
     shape = (batch, channels, scale.shape[2] * scale.shape[3])
     best = torch.zeros_like(sampler.image[:, :, :1]).expand(shape)
     winner = torch.full(shape, none, dtype=torch.int32, device=input.device)
     for number, tap in enumerate(sampler.taps()):
-        shares, present = sampler.shares(tap)
+        shares = sampler.shares(tap)
+        # A tap that sees nothing is one of zeros; there is none where its scale is not finite.
+        present = torch.stack([share.weight != 0 for share in shares]).any(0)
         value = sampler.value(shares)
         wins = present[:, None] & ((winner == none) | (value > best) | value.isnan())
         best = torch.where(wins, value, best)
@@ -72,14 +74,14 @@ def max_backward(
 ) -> tuple[Tensor, Tensor]:
     """``torch.ops.surfconv.surf_max_pool2d_backward``: gradients of input and scale."""
     place = Place(scale, guide, guide_tolerance, kernel, stride, padding, dilation)
-    sampler = MaxSampler(input, place)
+    sampler = Sampler(input, place, clamped=True)
     outer = grad_output.to(sampler.dtype).flatten(2)
     winners = winner.permute(0, 3, 1, 2).flatten(2)
     sums = _Gradients(sampler.image, need_input, need_scale)
     for number, tap in enumerate(sampler.taps()):
         chosen = winners == number
         pulled = torch.where(chosen, outer, 0.0)
-        for share in sampler.shares(tap)[0]:
+        for share in sampler.shares(tap):
             # A pixel that is not finite concerns no channel but those that it has won.
             sums.add(share, pulled, torch.where(chosen, pixels(sampler.image, share.corner), 0.0))
     return sums.result(input, scale)
@@ -134,11 +136,10 @@ def avg_backward(
     outer = _divide(outer, divisor)
     sums = _Gradients(sampler.image, need_input, need_scale)
     for tap in sampler.taps():
-        for corner in tap.corners:
-            share = sampler.share(tap, corner, sampler.seen(corner))
+        for share, corner in zip(sampler.shares(tap), tap.corners, strict=True):
             # Where a corner's weight is a part of the divisor, the mean comes off its value.
-            value = torch.where(share.corner.visible[:, None], pixels(sampler.image, corner), mean)
-            sums.add(share, outer, value - mean)
+            value = pixels(sampler.image, share.corner) - mean
+            sums.add(share, outer, torch.where(corner.visible[:, None], value, 0.0))
     return sums.result(input, scale)
 
 
@@ -160,13 +161,13 @@ def _fixed_divisor(input: Tensor, dtype: torch.dtype, place: Place, override: in
 
 
 def _window_sums(sampler: Sampler) -> tuple[Tensor, Tensor]:
-    """(N, C, Ho*Wo) sums of what the taps see, and (N, Ho*Wo) sums of the weights."""
+    """(N, C, Ho*Wo) sums of what the taps see, and (N, Ho*Wo) of the weights in the image."""
     total = sampler.image.new_zeros(())
     weight = sampler.image.new_zeros(())
     for tap in sampler.taps():
-        for corner in tap.corners:
-            share = sampler.share(tap, corner, sampler.seen(corner))
-            total = total + share.weight[:, None] * pixels(sampler.image, share.corner)
+        shares = sampler.shares(tap)
+        total = total + sampler.value(shares)
+        for share in shares:
             weight = weight + share.weight
     return total, weight
 

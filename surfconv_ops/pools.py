@@ -67,7 +67,8 @@ class SurfMaxPool2d(SurfPool2d, nn.MaxPool2d):
 
     At a pixel of depth z the taps lie ``reference_depth / z`` times as far apart as in
     nn.MaxPool2d, clamped into the image. Where the depth is invalid (zero, negative, NaN,
-    infinite) the layer is nn.MaxPool2d, unless ``invalid_scale`` says otherwise.
+    infinite) the layer is nn.MaxPool2d, unless ``invalid_scale`` says otherwise. What
+    ``depth_window`` or ``same_level_only`` hide counts as zero, which beats negative features.
 
     Args:
         kernel_size: As in nn.MaxPool2d.
@@ -187,7 +188,8 @@ class SurfAvgPool2d(SurfPool2d, nn.AvgPool2d):
 
     At a pixel of depth z the taps lie ``reference_depth / z`` times as far apart as in
     nn.AvgPool2d; outside the image is zero. Where the depth is invalid (zero, negative, NaN,
-    infinite) the layer is nn.AvgPool2d, unless ``invalid_scale`` says otherwise.
+    infinite) the layer is nn.AvgPool2d, unless ``invalid_scale`` says otherwise. What
+    ``depth_window`` or ``same_level_only`` hide counts as zero too.
 
     Args:
         kernel_size: As in nn.AvgPool2d.

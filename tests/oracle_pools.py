@@ -82,6 +82,7 @@ class Corner(NamedTuple):
     x: int
     weight: float
     slopes: tuple[float, float]  # by scale_y and by scale_x
+    seen: bool  # a hidden one counts as zero
 
 
 class Frame:
@@ -115,56 +116,32 @@ class Frame:
         with np.errstate(over="ignore"):
             return bool(np.abs(self.guide[y, x] - centre) <= self.tolerance)
 
-    def all_corners(self, oy: int, ox: int, ty: int, tx: int) -> list[Corner]:
-        """Corners of a tap in the image, whatever the guide says."""
+    def corners(self, oy: int, ox: int, ty: int, tx: int) -> list[Corner]:
+        """Corners of a tap in the image."""
         rows = ends(self.pool, 0, oy, ty, float(self.scale[0, oy, ox]), self.size[0])
         columns = ends(self.pool, 1, ox, tx, float(self.scale[-1, oy, ox]), self.size[1])
         return [
-            Corner(y.pixel, x.pixel, y.weight * x.weight, (y.slope * x.weight, y.weight * x.slope))
+            Corner(
+                y=y.pixel,
+                x=x.pixel,
+                weight=y.weight * x.weight,
+                slopes=(y.slope * x.weight, y.weight * x.slope),
+                seen=self.visible(oy, ox, y.pixel, x.pixel),
+            )
             for y in rows
             for x in columns
         ]
 
     def taps(self, oy: int, ox: int) -> Iterator[tuple[int, list[Corner]]]:
-        """Number of every tap, and its visible corners; a maximum's add up to 1."""
-        everything = [
-            self.all_corners(oy, ox, ty, tx)
-            for ty in range(self.pool.kernel[0])
-            for tx in range(self.pool.kernel[1])
-        ]
-        seen = [[c for c in tap if self.visible(oy, ox, c.y, c.x)] for tap in everything]
-        if not self.pool.average:
-            if not any(c.weight != 0 for tap in seen for c in tap):
-                seen = everything
-            seen = [
-                _evened(some) if _hides(tap, some) else some
-                for tap, some in zip(everything, seen, strict=True)
-            ]
-        yield from enumerate(seen)
-
-
-def _hides(everything: list[Corner], some: list[Corner]) -> bool:
-    shown = {(c.y, c.x) for c in some}
-    return any(c.weight != 0 and (c.y, c.x) not in shown for c in everything)
-
-
-def _evened(corners: list[Corner]) -> list[Corner]:
-    total = sum(c.weight for c in corners)
-    if total == 0:
-        return []
-    drift = [sum(c.slopes[i] for c in corners) for i in (0, 1)]
-    evened = []
-    for c in corners:
-        weight = c.weight / total
-        y, x = ((c.slopes[i] - weight * drift[i]) / total for i in (0, 1))
-        evened.append(Corner(c.y, c.x, weight, (y, x)))
-    return evened
+        """Number of every tap, and its corners."""
+        for number, (ty, tx) in enumerate(np.ndindex(*self.pool.kernel)):
+            yield number, self.corners(oy, ox, ty, tx)
 
 
 def _value(image: Array, corners: list[Corner]) -> Array:
     total = np.zeros(image.shape[0])
     for c in corners:
-        if c.weight != 0:
+        if c.weight != 0 and c.seen:
             total = total + c.weight * image[:, c.y, c.x]
     return total
 
@@ -256,12 +233,15 @@ def backward(
                 floats = not pool.count_include_pad and not pool.divisor_override
                 mean = _value(frame.image, corners) / divisor if floats else 0.0
                 for c in corners:
-                    grad_x[n, :, c.y, c.x] += c.weight * g / divisor
-                    part = float(g @ (frame.image[:, c.y, c.x] - mean)) / divisor
+                    grad_x[n, :, c.y, c.x] += c.weight * g / divisor if c.seen else 0.0
+                    value = frame.image[:, c.y, c.x] if c.seen else 0.0
+                    part = float(np.sum(g * (value - mean))) / divisor
                     slopes = [slopes[i] + c.slopes[i] * part for i in (0, 1)]
             else:
                 for k, tap in enumerate(_winners(frame, oy, ox)[1]):
                     for c in tap:
+                        if not c.seen:
+                            continue
                         grad_x[n, k, c.y, c.x] += c.weight * g[k]
                         part = float(g[k] * frame.image[k, c.y, c.x])
                         slopes = [slopes[i] + c.slopes[i] * part for i in (0, 1)]

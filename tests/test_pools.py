@@ -47,7 +47,7 @@ def test_guide(
 ) -> None:
     others = {} if mode == "max" else {"count_include_pad": count_include_pad}
     problem = make(mode, kernel=kernel, stride=1, guide=guide, guide_tolerance=tolerance,
-                   dtype=torch.float64, **others)  # fmt: skip
+                   axes=1 if kernel == 3 else 2, dtype=torch.float64, **others)  # fmt: skip
     problem.check_forward()
     problem.check_gradients()
     blind = replace(problem, guide=None)
@@ -183,28 +183,37 @@ def test_all_minus_infinity_is_a_maximum() -> None:
     assert_same_bits(ours, theirs)
 
 
-def test_hidden_pixels_do_not_count_as_zero_in_a_maximum() -> None:
-    x = -torch.ones(1, 1, 5, 5)
-    guide = torch.ones(1, 5, 5)
-    guide[0, :, 3:] = 2.0
-    out = surf_max_pool2d(x, 3, 1, 1, scale=torch.full((1, 5, 5), 0.8), guide=guide)
-    torch.testing.assert_close(out, x)
+@each_mode
+def test_hidden_pixels_count_as_zero(mode: str) -> None:
+    """One by one, as those outside the image do in an average, whose divisor they are a part of."""
+    x = torch.tensor([-1.0, -2.0, -4.0, -8.0]).view(1, 1, 1, 4)
+    guide = torch.tensor([[[1.0, 1.0, 5.0, 1.0]]])
+    if mode == "max":
+        out = surf_max_pool2d(x, (1, 3), 1, (0, 1), scale=torch.full((1, 1, 4), 0.75), guide=guide)
+        # Samples at 0, 0, 0.75; 0.25, 1, 1.75; 1.25, 2, 2.75; 2.25, 3, 3.
+        torch.testing.assert_close(out.flatten(), torch.tensor([-1.0, -0.5, -1.0, -2.0]))
+    for counts in (True, False) if mode == "avg" else ():
+        out = surf_avg_pool2d(x, (1, 3), 1, (0, 1), count_include_pad=counts,
+                              scale=torch.ones(1, 1, 4), guide=guide)  # fmt: skip
+        first, last = (3.0, 3.0) if counts else (2.0, 2.0)
+        expected = torch.tensor([-3 / first, -3 / 3, -4 / 3, -8 / last])
+        torch.testing.assert_close(out.flatten(), expected)
 
 
 @pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
-def test_a_guide_that_would_hide_every_tap_does_not_apply_to_a_maximum(layout: str) -> None:
+def test_a_guide_that_hides_every_tap_leaves_zeros(layout: str) -> None:
     problem = make("max", kernel=2, stride=1, padding=0, guide="depth", layout=layout, channels=4,
                    dtype=torch.float64)  # fmt: skip
     # Taps of a kernel of 2 then lie further from the centre than its own pixel.
     problem.scale += 3.1
-    out = problem.run()
     problem.check_forward()
     problem.check_gradients()
+    out = problem.run()
     # Clamped into the first row and column, a tap meets the first window's own pixel.
-    blind = replace(problem, guide=None).run()
-    assert_same_bits(out[..., 1:, :], blind[..., 1:, :])
-    average = replace(problem, mode="avg")
-    assert average.run().eq(0).all()
+    assert out[..., 1:, :].eq(0).all() and out[..., 0, 0].ne(0).any()
+    gradient = problem.gradients(torch.ones_like(out))["input"]
+    assert gradient[..., 1:, :].eq(0).all()
+    assert replace(problem, mode="avg").run().eq(0).all()
 
 
 @each_mode

@@ -66,13 +66,10 @@ def test_guide(case: dict[str, Any], guide: str) -> None:
     assert not torch.equal(out, replace(problem, guide=None).run())
 
 
-@pytest.mark.parametrize("case", [GUIDED[0], GUIDED[2]], ids=name_of)
 @pytest.mark.parametrize("fraction", [2.0**-26, 3 * 2.0**-26])
-def test_what_a_guide_leaves_of_a_sample_may_weigh_next_to_nothing(
-    case: dict[str, Any], fraction: float
-) -> None:
+def test_what_is_seen_of_a_sample_may_weigh_next_to_nothing(fraction: float) -> None:
     """Which weights are none, and quotients of the others, are the CPU's."""
-    problem = make(**case, channels=1, kernel=3, stride=1, guide="levels", axes=2)
+    problem = make(**GUIDED[2], channels=1, kernel=3, stride=1, guide="levels", axes=2)
     problem.scale[:, 0] = fraction
     out, expected = problem.run(), pools.Problem(**vars(problem))
     torch.testing.assert_close(out, expected.run(), rtol=1e-5, atol=1e-6)
@@ -81,12 +78,12 @@ def test_what_a_guide_leaves_of_a_sample_may_weigh_next_to_nothing(
         torch.testing.assert_close(grads[name], wanted[name], rtol=1e-5, atol=1e-5)
 
 
-def test_a_guide_that_would_hide_every_tap_does_not_apply_to_a_maximum() -> None:
+def test_a_guide_that_hides_every_tap_leaves_zeros() -> None:
     problem = make("max", kernel=2, stride=1, padding=0, guide="depth", dtype=torch.float64)
     # Taps of a kernel of 2 then lie further from the centre than its own pixel.
     problem.scale += 3.1
     out, _ = problem.check()
-    assert_same_bits(out[..., 1:, :], replace(problem, guide=None).run()[..., 1:, :])
+    assert out[..., 1:, :].eq(0).all() and out[..., 0, 0].ne(0).any()
     assert replace(problem, mode="avg").run().eq(0).all()
 
 

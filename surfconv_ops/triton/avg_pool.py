@@ -98,7 +98,7 @@ def avg_forward_kernel(
         )
         total += interpolate(image, pixels, samples, channel, exists, 2, 2)
         if DIVISOR == BY_WEIGHT:
-            divisor += weight_of_samples(image, pixels, samples)
+            divisor += weight_of_samples(image, samples)
     at = (pixels.number * channels)[:, None] + channel[None, :]
     tl.store(
         output_ptr + at,
@@ -168,7 +168,7 @@ def avg_backward_kernel(
             samples = pool_samples_of(
                 image, pixels, tap, KERNEL_Y, KERNEL_X, DILATION_Y, DILATION_X, LIMIT, False
             )
-            divisor += weight_of_samples(image, pixels, samples)
+            divisor += weight_of_samples(image, samples)
             if NEED_SCALE:
                 total += interpolate(image, pixels, samples, channel, exists, 2, 2)
         # Where a corner's weight is a part of the divisor, the mean comes off its value.

@@ -6,7 +6,7 @@ import triton
 import triton.language as tl
 
 from .accumulate import accumulate
-from .taps import Image, corner, samples_of, share, tile_of_pixels
+from .taps import Image, corner, has_corner, samples_of, share, tile_of_pixels
 
 
 @triton.jit
@@ -67,7 +67,7 @@ def pulled_by_tap(
 def rise_of_samples(image, pixels, samples, channel, exists, mean=None):
     """(pixels, channels) derivatives of a tap's samples with respect to both scales.
 
-    ``mean``: comes off the values that are seen.
+    ``mean``: comes off the values of all corners in the image, of which hidden ones are zero.
     """
     along_y = tl.zeros((pixels.number.shape[0], channel.shape[0]), samples.fraction_y.dtype)
     along_x = along_y
@@ -83,7 +83,8 @@ def rise_of_samples(image, pixels, samples, channel, exists, mean=None):
             weighs = (weight_y * weight_x != 0)[:, None]
             value = tl.where(weighs | (tl.abs(value) < float("inf")), value, 0.0)
             if mean is not None:
-                value = tl.where(mask, value - mean, 0.0)
+                inside = has_corner(image, samples, i, j)[:, None]
+                value = tl.where(inside & exists[None, :], value - mean, 0.0)
             along_y += (weight_x * (2 * i - 1))[:, None] * value
             along_x += (weight_y * (2 * j - 1))[:, None] * value
     # Where a tap does not move, 0 * inf must not appear.

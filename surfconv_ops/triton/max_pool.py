@@ -6,68 +6,8 @@ import triton
 import triton.language as tl
 
 from .accumulate import accumulate
-from .pool_taps import (
-    as_column,
-    block_of_channels,
-    divide,
-    pool_samples_of,
-    slopes_of_corner,
-    weight_of_samples,
-)
-from .taps import Image, Pixels, corner, share, tile_of_pixels
-
-
-@triton.jit
-def unblinded(
-    image,
-    pixels,
-    KERNEL_Y: tl.constexpr,
-    KERNEL_X: tl.constexpr,
-    DILATION_Y: tl.constexpr,
-    DILATION_X: tl.constexpr,
-    LIMIT: tl.constexpr,
-):
-    """The same tile, without a guide at pixels where it would hide every tap."""
-    weight = tl.zeros_like(pixels.scale_y)
-    for tap in range(KERNEL_Y * KERNEL_X):
-        samples = pool_samples_of(
-            image, pixels, tap, KERNEL_Y, KERNEL_X, DILATION_Y, DILATION_X, LIMIT, True
-        )
-        weight += weight_of_samples(image, pixels, samples)
-    # A guide that is not finite does not apply.
-    guide = tl.where(weight != 0, pixels.guide, float("nan"))
-    return Pixels(
-        pixels.number, pixels.exist, pixels.scale_at, pixels.scale_y, pixels.scale_x,
-        pixels.centre_y, pixels.centre_x, pixels.origin, guide,
-    )  # fmt: skip
-
-
-@triton.jit
-def evening(image, pixels, samples):
-    """What to divide the weights of each sample's corners by, so that they add up to 1.
-
-    Also the sums of the weights' slopes that come off with it, and which samples see anything.
-    """
-    total = 0.0 * samples.fraction_y
-    drift_y = total
-    drift_x = total
-    hidden = total
-    for i in tl.static_range(2):
-        for j in tl.static_range(2):
-            weight = share(samples.fraction_y, i) * share(samples.fraction_x, j)
-            slope_y, slope_x = slopes_of_corner(samples, i, j)
-            seen, step = corner(image, pixels, samples, i, j)
-            total += tl.where(seen, weight, 0.0)
-            hidden += tl.where(seen, 0.0, weight)
-            drift_y += tl.where(seen, slope_y, 0.0)
-            drift_x += tl.where(seen, slope_x, 0.0)
-    uneven = (hidden != 0) & (total != 0)
-    return (
-        tl.where(uneven, total, 1.0),
-        tl.where(uneven, drift_y, 0.0),
-        tl.where(uneven, drift_x, 0.0),
-        total != 0,
-    )
+from .pool_taps import as_column, block_of_channels, pool_samples_of, slopes_of_corner
+from .taps import Image, corner, share, tile_of_pixels
 
 
 @triton.jit
@@ -107,18 +47,12 @@ def max_forward_kernel(
         tile * BLOCK_PIXELS, count, plane, columns, image, scale_ptr,
         stride_y, stride_x, first_y, first_x, AXES, ACC, INDEX, BLOCK_PIXELS,
     )  # fmt: skip
-    if guide_ptr is not None:
-        pixels = unblinded(image, pixels, KERNEL_Y, KERNEL_X, DILATION_Y, DILATION_X, LIMIT)
     best = tl.zeros((BLOCK_PIXELS, BLOCK_CHANNELS), ACC)
     winner = tl.full((BLOCK_PIXELS, BLOCK_CHANNELS), KERNEL_Y * KERNEL_X, tl.int32)
     for tap in range(KERNEL_Y * KERNEL_X):
         samples = pool_samples_of(
             image, pixels, tap, KERNEL_Y, KERNEL_X, DILATION_Y, DILATION_X, LIMIT, True
         )
-        present = samples.reached
-        total = samples.fraction_y
-        if guide_ptr is not None:
-            total, drift_y, drift_x, present = evening(image, pixels, samples)
         value = tl.zeros((BLOCK_PIXELS, BLOCK_CHANNELS), ACC)
         first = input_ptr + (samples.place * channels)[:, None] + channel[None, :]
         for i in tl.static_range(2):
@@ -127,12 +61,11 @@ def max_forward_kernel(
                 seen, step = corner(image, pixels, samples, i, j)
                 # Without weight a corner is not seen: 0 * inf must not appear.
                 mask = (seen & (weight != 0))[:, None] & exists[None, :]
-                if guide_ptr is not None:
-                    weight = divide(weight, total)
                 pixel = tl.load(first + step * channels, mask=mask, other=0.0)
                 value += weight[:, None] * pixel.to(ACC)
         is_first = winner == KERNEL_Y * KERNEL_X
-        wins = present[:, None] & (is_first | (value > best) | (value != value))
+        # A tap that sees nothing is one of zeros; there is none where its scale is not finite.
+        wins = samples.reached[:, None] & (is_first | (value > best) | (value != value))
         best = tl.where(wins, value, best)
         winner = tl.where(wins, tap, winner)
     at = (pixels.number * channels)[:, None] + channel[None, :]
@@ -188,8 +121,6 @@ def max_backward_kernel(
         tile * BLOCK_PIXELS, count, plane, columns, image, scale_ptr,
         stride_y, stride_x, first_y, first_x, AXES, ACC, INDEX, BLOCK_PIXELS,
     )  # fmt: skip
-    if guide_ptr is not None:
-        pixels = unblinded(image, pixels, KERNEL_Y, KERNEL_X, DILATION_Y, DILATION_X, LIMIT)
     at = (pixels.number * channels)[:, None] + channel[None, :]
     exist = pixels.exist[:, None] & (channel < channels)[None, :]
     tap = tl.load(winner_ptr + at, mask=exist, other=0).to(tl.int32)
@@ -200,8 +131,6 @@ def max_backward_kernel(
     samples = pool_samples_of(
         image, beside, tap, KERNEL_Y, KERNEL_X, DILATION_Y, DILATION_X, LIMIT, True
     )
-    if guide_ptr is not None:
-        total, drift_y, drift_x, present = evening(image, beside, samples)
     rise_y = tl.zeros((BLOCK_PIXELS, BLOCK_CHANNELS), ACC)
     rise_x = tl.zeros((BLOCK_PIXELS, BLOCK_CHANNELS), ACC)
     first = samples.place * channels + channel[None, :]
@@ -211,10 +140,6 @@ def max_backward_kernel(
             slope_y, slope_x = slopes_of_corner(samples, i, j)
             seen, step = corner(image, beside, samples, i, j)
             seen = seen & won
-            if guide_ptr is not None:
-                weight = divide(weight, total)
-                slope_y = divide(slope_y - weight * drift_y, total)
-                slope_x = divide(slope_x - weight * drift_x, total)
             if NEED_SCALE:
                 value = tl.load(input_ptr + first + step * channels, mask=seen, other=0.0).to(ACC)
                 # A finite value without weight still has the derivative of a sample on a pixel.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from .taps import Pixels, Samples, corner, samples_of, share
+from .taps import Pixels, Samples, has_corner, samples_of, share
 
 
 @triton.jit
@@ -43,7 +43,7 @@ def pool_samples_of(
         DILATION_X, LIMIT, CLAMPED,
     )  # fmt: skip
     # In steps of what 1 - fraction can tell, so that a quotient of weights keeps its precision
-    # where the guide leaves nothing but a corner that is all but at its end.
+    # where the image ends beside a corner that is all but at its end.
     fraction_y = 1 - (1 - at.fraction_y)
     fraction_x = 1 - (1 - at.fraction_x)
     return Samples(
@@ -52,14 +52,13 @@ def pool_samples_of(
 
 
 @triton.jit
-def weight_of_samples(image, pixels, samples):
-    """What the seen corners of each sample weigh together."""
+def weight_of_samples(image, samples):
+    """What the corners of each sample weigh together that lie in the image, seen or hidden."""
     total = 0.0 * samples.fraction_y
     for i in tl.static_range(2):
         for j in tl.static_range(2):
             weight = share(samples.fraction_y, i) * share(samples.fraction_x, j)
-            seen, step = corner(image, pixels, samples, i, j)
-            total += tl.where(seen, weight, 0.0)
+            total += tl.where(has_corner(image, samples, i, j), weight, 0.0)
     return total
 
 

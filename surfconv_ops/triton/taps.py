@@ -129,11 +129,17 @@ def share(fraction, SIDE: tl.constexpr):
 
 
 @triton.jit
-def corner(image, pixels, samples, SIDE_Y: tl.constexpr, SIDE_X: tl.constexpr):
-    """Which samples see a corner, whatever its weight, and its distance from theirs in memory."""
+def has_corner(image, samples, SIDE_Y: tl.constexpr, SIDE_X: tl.constexpr):
+    """Which samples have a corner in the image, seen or hidden."""
     y = samples.y + SIDE_Y
     x = samples.x + SIDE_X
-    seen = samples.reached & (y >= 0) & (y < image.height) & (x >= 0) & (x < image.width)
+    return samples.reached & (y >= 0) & (y < image.height) & (x >= 0) & (x < image.width)
+
+
+@triton.jit
+def corner(image, pixels, samples, SIDE_Y: tl.constexpr, SIDE_X: tl.constexpr):
+    """Which samples see a corner, whatever its weight, and its distance from theirs in memory."""
+    seen = has_corner(image, samples, SIDE_Y, SIDE_X)
     step = tl.cast(image.width, tl.int64) * SIDE_Y + SIDE_X
     if image.guide is not None:
         there = tl.load(image.guide + samples.place + step, mask=seen, other=0.0)

@@ -1,4 +1,5 @@
-// The corners of one output pixel's taps: those of tap t are entries first[t] .. first[t + 1] - 1.
+// The corners that one output pixel's taps see: those of tap t are entries first[t] ..
+// first[t + 1] - 1. What the guide hides counts as zero: it has no entry, but weighs in the total.
 template <class T>
 struct PoolCorners {
   const int64_t* offset;  // elements from the image's first pixel
@@ -8,9 +9,14 @@ struct PoolCorners {
   const int32_t* first;
   int64_t step;  // from entry to entry in the four arrays above
   int64_t count;
-  int each;          // corners of every tap, 0 where they differ
-  T total;           // of the weights
-  bool moves_total;  // whether it changes with the scale
+  int each;                                // corners of every tap, 0 where they differ
+  T total;                                 // of the weights
+  bool moves_total;                        // whether it changes with the scale
+  const bool* hidden = nullptr;            // taps all of whose corners the guide hides
+  T hidden_slope = 0, hidden_slope_x = 0;  // of the weights of all that it hides
+
+  bool sees(int64_t t) const { return first[t] != first[t + 1]; }
+  bool has_tap(int64_t t) const { return sees(t) || (hidden != nullptr && hidden[t]); }
 };
 
 // Memory of corners, [entry][pixel].

@@ -20,12 +20,14 @@ SURFCONV_INLINE void max_of_taps(const T* image, const PoolCorners<T>& corners, 
   for (int64_t t = 0; t < taps; ++t) {
     const int32_t begin = Each != 0 ? static_cast<int32_t>(t) * Each : corners.first[t];
     const int32_t end = Each != 0 ? begin + Each : corners.first[t + 1];
-    if (Each == 0 && begin == end) continue;
-    V value[Vectors];
+    if (Each == 0 && !corners.has_tap(t)) continue;
+    V value[Vectors] = {};
+    if (Each != 0 || begin != end) {
 #pragma GCC unroll 4
-    for (int i = 0; i < Vectors; ++i) {
-      value[i] =
-          corners.weight[begin * step] * load<V>(image + corners.offset[begin * step] + i * Lanes);
+      for (int i = 0; i < Vectors; ++i) {
+        value[i] = corners.weight[begin * step] *
+                   load<V>(image + corners.offset[begin * step] + i * Lanes);
+      }
     }
     for (int32_t q = begin + 1; q < end; ++q) {
 #pragma GCC unroll 4
@@ -48,10 +50,8 @@ SURFCONV_INLINE void max_of_taps(const T* image, const PoolCorners<T>& corners, 
 }
 
 template <int Each, class T, class W>
-void max_of_pixel(const T* image, const PoolCorners<T>& corners, int64_t taps, int64_t channels,
-                  T* out, W* winners) {
-  int32_t fallback = 0;  // the first tap there is
-  while (corners.first[fallback] == corners.first[fallback + 1]) ++fallback;
+void max_of_pixel(const T* image, const PoolCorners<T>& corners, int64_t taps, int32_t fallback,
+                  int64_t channels, T* out, W* winners) {
   constexpr int lanes = kComparedLanes<T>, step = lanes * kMaxVectors;
   int64_t c = 0;
   for (; c + step <= channels; c += step) {
@@ -148,18 +148,20 @@ void max_pool_of(const Pool& pool, const PoolForwardTensors& tensors, const Exec
         [&](const auto& sampler, const T* image, int64_t, int64_t pixel, T* to) {
           const PoolCorners<T>& corners = sampler.corners;
           W* row = winners + pixel * channels;
-          if (corners.count == 0) {
+          int32_t fallback = 0;  // the first tap there is
+          while (fallback < taps && !corners.has_tap(fallback)) ++fallback;
+          if (fallback == taps) {
             std::fill_n(to, padded, T(0));
             std::fill_n(row, channels, static_cast<W>(taps));
             return;
           }
           const auto run = [&](W* numbers) {
             if (corners.each == 4) {
-              max_of_pixel<4>(image, corners, taps, padded, to, numbers);
+              max_of_pixel<4>(image, corners, taps, fallback, padded, to, numbers);
             } else if (corners.each == 1) {
-              max_of_pixel<1>(image, corners, taps, padded, to, numbers);
+              max_of_pixel<1>(image, corners, taps, fallback, padded, to, numbers);
             } else {
-              max_of_pixel<0>(image, corners, taps, padded, to, numbers);
+              max_of_pixel<0>(image, corners, taps, fallback, padded, to, numbers);
             }
           };
           if (padded == channels) return run(row);

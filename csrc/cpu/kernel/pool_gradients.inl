@@ -27,7 +27,7 @@ SURFCONV_INLINE void for_winners(const PoolCorners<T>& corners, int64_t taps, in
     using Numbers = Vec<Number, lanes>;
     const auto winner = __builtin_convertvector(load<Vec<W, lanes>>(winners + c), Numbers);
     for (int64_t t = 0; t < taps; ++t) {
-      if (corners.first[t] == corners.first[t + 1]) continue;
+      if (!corners.sees(t)) continue;
       body(c, width, t, equal_lanes(winner, Numbers{} + static_cast<Number>(t)));
     }
   };
@@ -111,6 +111,8 @@ ScaleGradient<T> slopes_of_average(const PoolCorners<T>& corners, bool weighted,
   if (divisor == 0) return {};
   double gain = 0, gain_x = 0;
   if (weighted && corners.moves_total) {
+    gain = static_cast<double>(corners.hidden_slope);
+    gain_x = static_cast<double>(corners.hidden_slope_x);
     for (int64_t q = 0; q < corners.count; ++q) {
       gain += static_cast<double>(corners.slope[q * corners.step]);
       if (S == Slopes::two) gain_x += static_cast<double>(corners.slope_x[q * corners.step]);

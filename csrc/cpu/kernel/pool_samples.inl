@@ -9,7 +9,7 @@ class PoolSampler {
     }
     return PoolAxis<T>::need(pool.y) + PoolAxis<T>::need(pool.x) +
            CornerMemory<T>::need(listed_entries(pool)) + Workspace::need<int32_t>(pool.taps() + 1) +
-           patterns;
+           Workspace::need<bool>(pool.taps()) + patterns;
   }
 
   // Steps of the image whose corners are listed, in elements.
@@ -23,6 +23,7 @@ class PoolSampler {
     columns_.take(pool.x, memory);
     listed_.take(listed_entries(pool), memory);
     first_ = memory.take<int32_t>(pool.taps() + 1);
+    hidden_ = memory.take<bool>(pool.taps());
     if (has_patterns_) {
       whole_.take(pool, Cell::whole, memory);
       on_grid_.take(pool, kOnGrid, memory);
@@ -77,8 +78,6 @@ class PoolSampler {
     if (!(std::fabs(centre) <= std::numeric_limits<T>::max())) return list_seen<false>(m);
     centre_ = centre;
     list_seen<true>(m);
-    // A maximum that sees nothing through its guide goes without.
-    if (E == Edges::clamp && corners.total == 0) list_seen<false>(m);
   }
 
   // An average's divisor at pixel m, whose corners are listed.
@@ -120,13 +119,13 @@ class PoolSampler {
     const CornerMemory<T>& to = listed_;
     int32_t n = 0;
     int64_t t = 0;
-    T total = 0;
+    T total = 0, hidden_slope = 0, hidden_slope_x = 0;
     int least = 4, most = 0;
     const T tolerance = static_cast<T>(pool_.guide_tolerance);
     for (int64_t ty = 0; ty < pool_.y.kernel; ++ty) {
       for (int64_t tx = 0; tx < pool_.x.kernel; ++tx, ++t) {
         const int32_t begin = first_[t] = n;
-        bool hidden = false;
+        bool hides = false;
         for (int side = 0; side < 4; ++side) {
           const int64_t at_y = (ty * 2 + side / 2) * kTile + m;
           const int64_t at_x = (tx * 2 + side % 2) * kTile + m;
@@ -142,43 +141,36 @@ class PoolSampler {
             to.slope_x[n] = along_x;
             kept |= (along_y != 0) | (along_x != 0);
           }
+          total += weight;
           if constexpr (Guided) {
-            const bool seen =
-                !kept || std::fabs(guide_[row * pool_.x.in + column] - centre_) <= tolerance;
-            hidden |= !seen & (weight != 0);
-            kept &= seen;
+            if (kept && !(std::fabs(guide_[row * pool_.x.in + column] - centre_) <= tolerance)) {
+              kept = false;
+              hides |= weight != 0;
+              if constexpr (kSloped) hidden_slope += to.slope[n], hidden_slope_x += to.slope_x[n];
+            }
           }
-          total += kept ? weight : T(0);
           n += kept;
         }
-        if constexpr (Guided && E == Edges::clamp) {
-          if (hidden) even_out(begin, n);
-        }
+        if constexpr (Guided) hidden_[t] = hides && n == begin;
         least = std::min(least, n - begin);
         most = std::max(most, n - begin);
       }
     }
     first_[t] = n;
     const int each = least == most ? least : 0;
-    corners = {to.offset, to.weight, to.slope, to.slope_x, first_, 1, n, each, total, true};
-  }
-
-  // Weights that add up to 1, and the slopes of their quotients.
-  void even_out(int32_t begin, int32_t end) {
-    const CornerMemory<T>& to = listed_;
-    T weight = 0, slope = 0, slope_x = 0;
-    for (int32_t q = begin; q < end; ++q) {
-      weight += to.weight[q];
-      if constexpr (kSloped) slope += to.slope[q], slope_x += to.slope_x[q];
-    }
-    if (weight == 0) return;
-    for (int32_t q = begin; q < end; ++q) {
-      to.weight[q] /= weight;
-      if constexpr (kSloped) {
-        to.slope[q] = (to.slope[q] - to.weight[q] * slope) / weight;
-        to.slope_x[q] = (to.slope_x[q] - to.weight[q] * slope_x) / weight;
-      }
-    }
+    corners = {to.offset,
+               to.weight,
+               to.slope,
+               to.slope_x,
+               first_,
+               1,
+               n,
+               each,
+               total,
+               true,
+               Guided ? hidden_ : nullptr,
+               hidden_slope,
+               hidden_slope_x};
   }
 
   const Pool& pool_;
@@ -189,6 +181,7 @@ class PoolSampler {
   CornerPattern<T> whole_, on_grid_;
   CornerMemory<T> listed_;
   int32_t* first_;
+  bool* hidden_;
   const T* guide_ = nullptr;
   T centre_ = 0;
   int64_t oy_[kTile], ox_[kTile];
