@@ -125,7 +125,7 @@ def backward(
 
 def level_values(depth: Tensor, edges: Tensor, values: Tensor) -> Tensor:
     """``values[level]`` of every depth; the last value stands where a depth is invalid."""
-    level = torch.bucketize(depth, edges)
+    level = torch.bucketize(depth.contiguous(), edges)
     return values[torch.where(valid_depth(depth), level, -1)]
 
 

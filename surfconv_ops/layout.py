@@ -28,3 +28,15 @@ def lay_out(tensor: Tensor, memory_format: torch.memory_format) -> Tensor:
     if memory_format == torch.channels_last:
         return tensor.permute(0, 2, 3, 1).contiguous().permute(0, 3, 1, 2)
     return tensor.contiguous()
+
+
+def with_own_gradient(tensor: Tensor) -> Tensor:
+    """The same 4-D tensor, whose gradient autograd will hand back in its memory format.
+
+    A detour through its memory's order, which costs nothing forward.
+    """
+    if memory_format_of(tensor) == torch.contiguous_format:
+        return tensor
+    batch, channels, height, width = tensor.shape
+    flat = tensor.permute(0, 2, 3, 1).reshape(-1)
+    return flat.reshape(batch, height, width, channels).permute(0, 3, 1, 2)

@@ -18,7 +18,7 @@ from torch import Tensor
 from .autocast import autocast_disabled, cast_to_autocast_dtype
 from .checks import PaddingArgument, PairArgument
 from .geometry import Pair
-from .layout import lay_out, memory_format_of
+from .layout import lay_out, memory_format_of, with_own_gradient
 from .sampling import pixels, sample, seen, taps
 from .validation import check_surf_conv2d
 
@@ -79,6 +79,11 @@ def surf_conv2d(
     input, weight, bias = cast_to_autocast_dtype(input, weight, bias)
     arguments, batched = check_surf_conv2d(
         input, weight, bias, scale, guide, guide_tolerance, stride, padding, dilation, groups
+    )
+    arguments = arguments._replace(
+        input=with_own_gradient(arguments.input),
+        weight=with_own_gradient(arguments.weight),
+        scale=with_own_gradient(arguments.scale),
     )
     output = lay_out(forward(*arguments), memory_format_of(arguments.input))
     return output if batched else output.squeeze(0)

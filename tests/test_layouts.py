@@ -35,15 +35,18 @@ def test_output(operator: str, layout: str, dtype: torch.dtype) -> None:
     assert follows_rule(problem.run(OPERATORS[operator]), problem.input)
 
 
+@pytest.mark.parametrize("operator", OPERATORS)
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
-def test_each_gradient_follows_its_own_tensor(layout: str, dtype: torch.dtype) -> None:
+def test_each_gradient_follows_its_own_tensor(
+    operator: str, layout: str, dtype: torch.dtype
+) -> None:
     for name in ("input", "weight", "scale"):
         problem = make_problem(2, 4, 6, (6, 7), axes=2, dtype=dtype)
         problem = replace(problem, **{name: lay_out(getattr(problem, name), layout)})
         grad = torch.randn(problem.output_shape()).to(dtype)
         for grad_layout in ("contiguous", "channels_last"):
-            gradients = problem.gradients(surf_conv2d, lay_out(grad, grad_layout))
+            gradients = problem.gradients(OPERATORS[operator], lay_out(grad, grad_layout))
             for other in GRADIENTS:
                 owner = getattr(problem, other)
                 if owner.dim() == 4:
