@@ -6,7 +6,8 @@ PYTHON ?= python3
 TORCH ?= torch==2.13.0
 PYTEST_ARGS ?= -n 2
 BENCH_ARGS ?=
-GPU_TESTS ?= tests/test_gpu*.py tests/test_triton*.py tests/test_cuda_ops.py tests/test_benchmarks_gpu.py
+GPU_TESTS ?= tests/test_gpu*.py tests/test_triton*.py tests/test_cuda_ops.py \
+tests/test_benchmarks_gpu.py tests/test_metrics.py::test_on_cuda tests/test_d4_inputs.py::test_cuda
 
 VENV := .venv
 PY := $(VENV)/bin/python

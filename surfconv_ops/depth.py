@@ -255,6 +255,8 @@ def _warn_of_clamping(
         wanted = [r / metres for r in references]
         outside = [(w < limits.low) | (w > limits.high) for w in wanted]
         count = sum(int((valid_depth(metres) & o).sum()) for o in outside)
+    except torch.AcceleratorError:
+        raise
     except RuntimeError:
         # Under vmap and in traces values cannot be read; an eager call will tell.
         return

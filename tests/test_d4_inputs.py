@@ -45,6 +45,7 @@ def test_masked_pixels_are_holes() -> None:
     assert fit_depth_levels(depth, 1, 0.0).centers == (1.5,)
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_cuda() -> None:
     depth = torch.from_numpy(normal_depths(500))

@@ -293,6 +293,7 @@ def test_json_and_pickle() -> None:
     assert copy.compute()["pixels"] == 2 * figures["pixels"]
 
 
+@pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("deterministic", [False, True])
 def test_on_cuda(deterministic: bool) -> None:

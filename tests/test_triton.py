@@ -163,13 +163,26 @@ def test_passes_over_images(order: str, monkeypatch: pytest.MonkeyPatch) -> None
     grad = torch.randn(problem.output_shape()).half()
     whole = problem.gradients(operator, grad)
     made = []
-    monkeypatch.setattr(gradients, "_SUM_BYTES", 2 * 2 * 4 * 5 * (8 if order != "arrival" else 4))
+    two_images = 2 * 2 * 4 * 5 * (8 if order != "arrival" else 4)
+    monkeypatch.setattr(gradients, "_LEAST_SUM_BYTES", two_images)
     run_pass = gradients._pass
     monkeypatch.setattr(gradients, "_pass", lambda c, *a: made.append(c.batch) or run_pass(c, *a))
     for name, value in problem.gradients(operator, grad).items():
         torch.testing.assert_close(value, whole[name], rtol=2e-3, atol=2e-3, msg=name)
     assert made == [2, 2, 1]
     problem.check_gradients(operator, grad)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.float64], ids=str)
+@pytest.mark.parametrize("programs", [1, 10**6])
+def test_shares_of_the_weights_gradient(
+    dtype: torch.dtype, programs: int, order: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One share is written in place, more are added up: where all sizes are alike as well."""
+    monkeypatch.setattr(gradients, "_WEIGHT_PROGRAMS", programs)
+    for groups in (1, 3):
+        problem = make_problem(2, 3, 3, (6, 7), groups=groups, dtype=dtype)
+        problem.check_gradients(operator)
 
 
 def test_wide_positions(monkeypatch: pytest.MonkeyPatch) -> None:

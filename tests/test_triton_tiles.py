@@ -24,10 +24,14 @@ GPU = torch.device("cuda", 0)
 
 
 class Clock:
-    """Stands in for torch.cuda: tiles of 16 pixels take 3 ms, of 32 pixels 1 ms."""
+    """Stands in for torch.cuda: tiles of 16 pixels take 3 ms, of 32 pixels 1 ms.
+
+    A launch takes as long as the slowest of them, unless the device was busy before it.
+    """
 
     def __init__(self) -> None:
         self.now = 0.0
+        self.busy = False
         self.calls: list[Tiles] = []
         self.capturing = False
 
@@ -35,7 +39,13 @@ class Clock:
         self.calls.append(chosen)
         if chosen == LARGE:
             raise OutOfResources(300_000, 200_000, "shared memory")
-        self.now += 3.0 if chosen == SLOW else 1.0
+        self.now += 3.0 if chosen == SLOW or not self.busy else 1.0
+        self.busy = False
+
+    def occupy(self, device: torch.device) -> None:
+        assert device == GPU
+        self.busy = True
+        self.now += 10.0
 
 
 @pytest.fixture
@@ -57,6 +67,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
     monkeypatch.setattr(torch.cuda, "Event", Event)
     monkeypatch.setattr(torch.cuda, "is_current_stream_capturing", lambda: clock.capturing)
     monkeypatch.setattr(tiles, "_chosen", {})
+    monkeypatch.setattr(tiles, "_occupy", clock.occupy)
     yield clock
     torch.use_deterministic_algorithms(False)
 

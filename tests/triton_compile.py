@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -45,18 +46,22 @@ def layer(
 def jobs(full: bool) -> Iterator[tuple[str, Any, dict[str, Any]]]:
     """Kernel, layer, and what else it is compiled for."""
     half = (torch.bfloat16, torch.float16) if full else (torch.bfloat16,)
-    layers = [layer(64, dtype) for dtype in half]
+    layers = [layer(64, dtype) for dtype in (*half, torch.float32)]
     layers.append(layer(96, torch.float32, groups=96, kernel=7, axes=2))
     if full:
-        layers += [layer(64, torch.float32), layer(32, torch.float64), layer(512, torch.bfloat16),
+        layers += [layer(32, torch.float64), layer(512, torch.bfloat16), layer(512, torch.float32),
                    layer(64, torch.float32, groups=32)]  # fmt: skip
     for one in layers:
-        for guide in (False, True) if full else (one.axes == 2,):
-            yield "forward", one, {"guide": guide}
-            yield "backward_weight", one, {"guide": guide}
+        single = one.dtype == torch.float32
+        for tf32, guide in product((False, True) if single and full else (False,),
+                                   (False, True) if full else (one.axes == 2,)):  # fmt: skip
+            options = {"guide": guide, "tf32": tf32}
+            yield "forward", one, options
+            for adds in (True, False) if full else (True,):
+                yield "backward_weight", one, options | {"adds": adds}
             exact = 2 if one.dtype == torch.float64 else 1
             for words in (0, exact) if full else (0,):
-                yield "backward_data", one, {"guide": guide, "words": words}
+                yield "backward_data", one, options | {"words": words}
 
 
 def specification(kernel: str, one: Any, options: dict[str, Any], cut: Any) -> dict[str, Any]:
@@ -77,7 +82,9 @@ def specification(kernel: str, one: Any, options: dict[str, Any], cut: Any) -> d
                   "weight_ptr": data}  # fmt: skip
         constants |= {"NEED_INPUT": True, "NEED_SCALE": True, "WORDS": words}
     if kernel == "backward_weight":
-        types |= {"partial_ptr": total}
+        # Written in place or added to sums.
+        types |= {"sums_ptr": total if options["adds"] else data}
+        constants["ADDS"] = options["adds"]
     return {"input_ptr": data, "grad_output_ptr": data} | types | constants
 
 
@@ -125,9 +132,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--full", action="store_true", help="every tile size and more layers")
     full = parser.parse_args().full
-    torch.backends.cuda.matmul.allow_tf32 = True
     for capability in (80, 90) if full else (90,):
         for kernel, one, options in jobs(full):
+            torch.backends.cuda.matmul.allow_tf32 = options["tf32"]
             for cut in CUTS[kernel](one)[: None if full else 1]:
                 given = specification(kernel, one, options, cut)
                 result = compiled(KERNELS[kernel], given, capability)

@@ -69,9 +69,16 @@ class Sums:
 
     def result(self, dtype: torch.dtype) -> Tensor:
         """The sums in ``dtype``."""
+        if self.factors is None and self.totals.dtype == dtype:
+            return self.totals
+        shape = self.totals.shape if self.factors is None else self.totals.shape[1:]
+        return self.write(torch.empty(shape, dtype=dtype, device=self.totals.device))
+
+    def write(self, out: Tensor) -> Tensor:
+        """The sums, in ``out``: no second tensor of their size but where they are exact."""
         if self.factors is None:
-            return self.totals.to(dtype)
+            return out.copy_(self.totals)
         total = self.totals[0].double()
         if self.words == 2:
-            total = total + self.totals[1].double() / self.factors[1]
-        return (total / self.factors[0]).to(dtype)
+            total += self.totals[1].double() / self.factors[1]
+        return out.copy_(total.div_(self.factors[0]))

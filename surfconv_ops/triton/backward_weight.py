@@ -9,13 +9,26 @@ from .taps import Image, interpolate, samples_of, tile_of_pixels
 
 
 @triton.jit
+def put(at, value, mask, ADDS: tl.constexpr):
+    """Store a program's share, or add it to what other programs add."""
+    if ADDS:
+        tl.atomic_add(at, value, mask=mask, sem="relaxed")
+    else:
+        tl.store(at, value.to(at.dtype.element_ty), mask=mask)
+
+
+@triton.jit
 def backward_weight_kernel(
-    partial_ptr,
+    sums_ptr,
     grad_output_ptr,
     input_ptr,
     scale_ptr,
     guide_ptr,
     tolerance_ptr,
+    share_stride,
+    tap_stride,
+    in_stride,
+    out_stride,
     splits,
     tiles,
     count,
@@ -41,11 +54,12 @@ def backward_weight_kernel(
     ACC: tl.constexpr,
     LANES: tl.constexpr,
     PRECISION: tl.constexpr,
+    ADDS: tl.constexpr,
     BLOCK_PIXELS: tl.constexpr,
     BLOCK_IN: tl.constexpr,
     BLOCK_OUT: tl.constexpr,
 ):
-    """A block of one tap's gradient, summed over a share of the tiles: (splits, taps, C/g, O)."""
+    """A block of one tap's gradient, summed over a share of the tiles; added to what others add."""
     span = out_channels if LANES else group_out
     out_blocks = tl.cdiv(span, BLOCK_OUT)
     groups = 1 if LANES else out_channels // group_out
@@ -92,10 +106,11 @@ def backward_weight_kernel(
             lane_sums += tl.sum(seen * grad.to(ACC), axis=0)
         else:
             sums = tl.dot(tl.trans(seen.to(grad.dtype)), grad, sums, input_precision=PRECISION)
-    first_row = tl.cast(split * (KERNEL_Y * KERNEL_X) + tap, tl.int64) * group_channels
+    first = sums_ptr + tl.cast(split, tl.int64) * share_stride + tl.cast(tap, tl.int64) * tap_stride
+    column = out_channel.to(tl.int64) * out_stride
     if LANES:
-        at = (first_row + in_block) * out_channels + out_channel
-        tl.store(partial_ptr + at, lane_sums, mask=out_exists)
+        first += tl.cast(in_block, tl.int64) * in_stride
+        put(first + column, lane_sums, out_exists, ADDS)
     else:
-        at = ((first_row + row) * out_channels)[:, None] + out_channel[None, :]
-        tl.store(partial_ptr + at, sums, mask=in_exists[:, None] & out_exists[None, :])
+        at = (first + row.to(tl.int64) * in_stride)[:, None] + column[None, :]
+        put(at, sums, in_exists[:, None] & out_exists[None, :], ADDS)

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .. import depth_ops
 from .launch import on_device
+from .layer import refuse
 
 _BLOCK = 1024
 
@@ -70,6 +71,12 @@ def depth_to_scale_backward(
     grad: Tensor, depth: Tensor, reference_depth: float, low: float, high: float, steepest: float
 ) -> Tensor:
     """``torch.ops.surfconv.depth_to_scale_backward``."""
+    refuse(
+        (
+            (grad.shape, grad.dtype, grad.device) == (depth.shape, depth.dtype, depth.device),
+            "depth_to_scale_backward: grad must have the depth's shape, dtype and device",
+        )
+    )
     if depth.dtype != torch.float32:
         return depth_ops.backward_kernel(grad, depth, reference_depth, low, high, steepest)
     grad, depth = grad.contiguous(), depth.contiguous()

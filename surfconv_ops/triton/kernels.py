@@ -40,7 +40,13 @@ def forward(
         return wide.to(input.dtype)
     check_maps("surf_conv2d", input, scale, guide)
     conv = Conv.of(input, weight, scale, stride, padding, dilation, groups)
-    refuse((bias is None or bias.shape == (conv.out_channels,), "surf_conv2d: bias must be (O,)"))
+    kind = (bias.shape, bias.dtype, bias.device) if bias is not None else None
+    refuse(
+        (
+            kind in (None, ((conv.out_channels,), conv.dtype, input.device)),
+            "surf_conv2d: bias must be (O,) in the input's dtype and on its device",
+        )
+    )
     shape = (conv.batch, *conv.output, conv.out_channels)
     output = torch.empty(shape, dtype=conv.dtype, device=input.device)
     if output.numel():
@@ -100,7 +106,7 @@ def backward(
     check_maps("surf_conv2d_backward", input, scale, guide)
     conv = Conv.of(input, weight, scale, stride, padding, dilation, groups)
     shape = (conv.batch, conv.out_channels, *conv.output)
-    check_grad_output("surf_conv2d_backward", grad_output, shape)
+    check_grad_output("surf_conv2d_backward", grad_output, input, shape)
     grads = [input.new_empty(0), weight.new_empty(0), weight.new_empty(0), scale.new_empty(0)]
     with on_device(input):
         outer, image = channels_innermost(grad_output), channels_innermost(input)
@@ -118,8 +124,7 @@ def backward(
                 grad_scale = grad_scale.reshape(scale.shape).to(scale.dtype)
                 grads[3] = lay_out(grad_scale, memory_format_of(scale))
         if need_weight:
-            total = gradient_of_weight(conv, operands).to(weight.dtype)
-            grads[1] = lay_out(total, memory_format_of(weight))
+            grads[1] = lay_out(gradient_of_weight(conv, operands), memory_format_of(weight))
         if need_bias:
             total = outer.sum((0, 1, 2), dtype=conv.compute_dtype)
             grads[2] = total.to(weight.dtype)

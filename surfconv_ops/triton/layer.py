@@ -127,6 +127,7 @@ def refuse(*conditions: tuple[bool, str]) -> None:
 def check_maps(name: str, input: Tensor, scale: Tensor, guide: Tensor | None) -> None:
     """What operator ``name`` needs of its maps."""
     batch = input.shape[0]
+    maps = (scale,) if guide is None else (scale, guide)
     refuse(
         (input.ndim == 4 and scale.ndim == 4, f"{name}: input and scale must have 4 dimensions"),
         (
@@ -137,12 +138,28 @@ def check_maps(name: str, input: Tensor, scale: Tensor, guide: Tensor | None) ->
             guide is None or guide.shape == (batch, *input.shape[2:]),
             f"{name}: guide must be (N, H, W)",
         ),
+        (
+            all(m.device == input.device for m in maps),
+            f"{name}: scale and guide must be on the input's device",
+        ),
+        (
+            all(m.dtype in (torch.float32, input.dtype) for m in maps),
+            f"{name}: scale and guide must be float32 or have the input's dtype",
+        ),
     )
 
 
-def check_grad_output(name: str, grad_output: Tensor, shape: tuple[int, ...]) -> None:
+def check_grad_output(
+    name: str, grad_output: Tensor, input: Tensor, shape: tuple[int, ...]
+) -> None:
     """What operator ``name`` needs of its output's gradient."""
-    refuse((grad_output.shape == shape, f"{name}: grad_output must have the output's shape"))
+    same = grad_output.dtype == input.dtype and grad_output.device == input.device
+    refuse(
+        (
+            grad_output.shape == shape and same,
+            f"{name}: grad_output must have the output's shape, dtype and device",
+        )
+    )
 
 
 def channels_innermost(tensor: Tensor) -> Tensor:

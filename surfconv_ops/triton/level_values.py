@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .depth_to_scale import valid
 from .launch import on_device
+from .layer import refuse
 
 _BLOCK = 1024
 
@@ -29,6 +30,16 @@ def level_values_kernel(
 
 def level_values(depth: Tensor, edges: Tensor, values: Tensor) -> Tensor:
     """``torch.ops.surfconv.level_values``."""
+    refuse(
+        (
+            all(t.dtype == depth.dtype and t.device == depth.device for t in (edges, values)),
+            "level_values: edges and values must have the depth's dtype and device",
+        ),
+        (
+            edges.ndim == 1 and values.shape == (edges.numel() + 2,),
+            "level_values: N levels have N - 1 edges and N + 1 values",
+        ),
+    )
     depth = depth.contiguous()
     out = torch.empty_like(depth)
     if depth.numel():

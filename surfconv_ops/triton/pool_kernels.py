@@ -86,11 +86,13 @@ def max_pool2d_backward(
         return _narrowed(in_float32(max_pool2d_backward, (*tensors, *others)), input, scale)
     check_maps("surf_max_pool2d_backward", input, scale, guide)
     layer = layer_of(input, scale, kernel, stride, padding, dilation)
-    check_grad_output("surf_max_pool2d_backward", grad_output, layer.output_shape)
+    check_grad_output("surf_max_pool2d_backward", grad_output, input, layer.output_shape)
     shape = (layer.batch, *layer.output, layer.channels)
     refuse(
         (
-            winner.shape == shape and winner.dtype == winner_dtype(layer.taps),
+            winner.shape == shape
+            and winner.dtype == winner_dtype(layer.taps)
+            and winner.device == input.device,
             "surf_max_pool2d_backward: winner must be what the forward returned",
         )
     )
@@ -182,7 +184,7 @@ def avg_pool2d_backward(
         return _narrowed(in_float32(avg_pool2d_backward, (*tensors, *others)), input, scale)
     check_maps("surf_avg_pool2d_backward", input, scale, guide)
     layer = layer_of(input, scale, kernel, stride, padding, (1, 1))
-    check_grad_output("surf_avg_pool2d_backward", grad_output, layer.output_shape)
+    check_grad_output("surf_avg_pool2d_backward", grad_output, input, layer.output_shape)
     # No tap weighs more than 1, nor more than a divisor that its weight is a part of.
     bound = (layer.pixels * layer.taps, 1.0 / abs(divisor_override or 1))
     gradients = _Gradients(layer, grad_output, input, scale, bound, need_input, need_scale)

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 import triton
 
-from .conv import LEAST_PRODUCT, Conv
+from .conv import LEAST_PRODUCT, Conv, tensor_float32
 from .layer import Layer
 
 #: Kernels of up to this many taps are written out tap by tap.
@@ -48,14 +48,23 @@ def _block(channels: int, most: int) -> int:
     return max(LEAST_PRODUCT, min(most, power))
 
 
+def _is_exact_float32(conv: Conv) -> bool:
+    """Whether the tensor cores cannot multiply: threads then hold more, and spill first."""
+    return conv.dtype == torch.float32 and not tensor_float32()
+
+
 def forward_tiles(conv: Conv) -> list[Tiles]:
     """Ways to cut the forward, the one to take without a choice first."""
     if conv.lanes:
         return [Tiles(32, 1, _block(conv.out_channels, 64), 4, 2)]
     inner, outer = _block(conv.group_channels, 64), _block(conv.group_out, 128)
     first = Tiles(64, min(inner, 32), min(outer, 64), 4, 3)
-    others = [replace(first, pixels=128, channels_out=outer, warps=8)]
-    others += [replace(others[0], channels_in=inner)]
+    if _is_exact_float32(conv):
+        first = replace(first, warps=8, stages=2)
+        others = [replace(first, channels_in=min(inner, 16))]
+    else:
+        others = [replace(first, pixels=128, channels_out=outer, warps=8)]
+        others += [replace(others[0], channels_in=inner)]
     if conv.taps <= MOST_UNROLLED_TAPS:
         others.append(replace(first, unrolled=True))
     return list(dict.fromkeys([first, *others]))
@@ -76,8 +85,10 @@ def weight_tiles(conv: Conv) -> list[Tiles]:
     if conv.lanes:
         return [Tiles(32, 1, _block(conv.out_channels, 64), 4, 2)]
     inner, outer = _block(conv.group_channels, 64), _block(conv.group_out, 64)
-    first = Tiles(64, inner, outer, 8, 2)
-    return list(dict.fromkeys([first, Tiles(32, inner, outer, 4, 3)]))
+    tiles = [Tiles(64, inner, outer, 8, 2), Tiles(32, inner, outer, 4, 3)]
+    if _is_exact_float32(conv):
+        tiles = [Tiles(32, inner, outer, 8, 2), tiles[0]]
+    return list(dict.fromkeys(tiles))
 
 
 _T = TypeVar("_T")
@@ -111,22 +122,32 @@ def fastest(
     if key not in _chosen:
         if torch.cuda.is_current_stream_capturing():
             return candidates[0]
-        _chosen[key] = min(candidates, key=lambda tiles: _seconds(run, tiles))
+        _chosen[key] = min(candidates, key=lambda tiles: _seconds(run, tiles, device))
     best: _T = _chosen[key]
     return best
 
 
-def _seconds(run: Callable[[_T], object], tiles: _T) -> float:
+def _seconds(run: Callable[[_T], object], tiles: _T, device: torch.device) -> float:
     try:
         run(tiles)
-    except triton.runtime.errors.OutOfResources:
+    except (triton.runtime.errors.OutOfResources, triton.runtime.errors.PTXASError):
         return float("inf")
     times: list[float] = []
     for _ in range(_ROUNDS):
         start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        # Meanwhile the launches queue up: what is timed is the device's work alone.
+        _occupy(device)
         start.record()
         run(tiles)
         end.record()
         end.synchronize()
         times.append(start.elapsed_time(end))
     return median(times)
+
+
+def _occupy(device: torch.device) -> None:
+    """Give a device work for longer than the launches of a layer take."""
+    # On an H100 a quarter of a millisecond.
+    buffer = torch.empty(64 * 2**20, dtype=torch.int8, device=device)
+    for _ in range(10):
+        buffer.zero_()
