@@ -64,7 +64,8 @@ def forward_tiles(conv: Conv) -> list[Tiles]:
         others = [replace(first, channels_in=min(inner, 16))]
     else:
         others = [replace(first, pixels=128, channels_out=outer, warps=8)]
-        others += [replace(others[0], channels_in=inner)]
+        if conv.dtype != torch.float32:
+            others.append(replace(others[0], channels_in=inner))
     if conv.taps <= MOST_UNROLLED_TAPS:
         others.append(replace(first, unrolled=True))
     return list(dict.fromkeys([first, *others]))
@@ -85,9 +86,11 @@ def weight_tiles(conv: Conv) -> list[Tiles]:
     if conv.lanes:
         return [Tiles(32, 1, _block(conv.out_channels, 64), 4, 2)]
     inner, outer = _block(conv.group_channels, 64), _block(conv.group_out, 64)
-    tiles = [Tiles(64, inner, outer, 8, 2), Tiles(32, inner, outer, 4, 3)]
-    if _is_exact_float32(conv):
-        tiles = [Tiles(32, inner, outer, 8, 2), tiles[0]]
+    first = Tiles(64, inner, outer, 8, 2)
+    tiles = [first, Tiles(32, inner, outer, 4, 3)]
+    if conv.dtype == torch.float32:
+        # Twice as wide: less of it at a time.
+        tiles = [replace(first, pixels=32), first]
     return list(dict.fromkeys(tiles))
 
 
