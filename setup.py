@@ -278,7 +278,7 @@ class UniversalWheel(bdist_wheel):
 def extensions() -> list[Extension]:
     if WHY_NO_BINARY:
         return []
-    sources = sorted([*ROOT.glob("csrc/*.cpp"), *ROOT.glob("csrc/cpu/*.cpp")])
+    sources = sorted(ROOT.glob("csrc/**/*.cpp"))
     return [Extension("surfconv_ops._C", [str(path.relative_to(ROOT)) for path in sources])]
 
 

@@ -3,16 +3,33 @@
 #include <vector>
 
 #include "surf_conv2d.h"
+#include "surf_pool2d.h"
 
 namespace surfconv::cpu {
 
-extern const Kernels kernels_default;
+// What cpu/isa compiles for each instruction set.
+#define SURFCONV_DECLARE(isa)                                          \
+  namespace isa {                                                      \
+  void forward(const Conv&, const ForwardTensors&, const Executor&);   \
+  void backward(const Conv&, const BackwardTensors&, const Executor&); \
+  extern const PoolKernels pool_kernels;                               \
+  }
+#define SURFCONV_KERNELS(name) \
+  {#name, name##_isa::forward, name##_isa::backward, &name##_isa::pool_kernels}
+
+SURFCONV_DECLARE(default_isa)
 #if defined(SURFCONV_X86)
-extern const Kernels kernels_avx2;
-extern const Kernels kernels_avx512;
+SURFCONV_DECLARE(avx2_isa)
+SURFCONV_DECLARE(avx512_isa)
 #endif
 
 namespace {
+
+const Kernels kernels_default = SURFCONV_KERNELS(default);
+#if defined(SURFCONV_X86)
+const Kernels kernels_avx2 = SURFCONV_KERNELS(avx2);
+const Kernels kernels_avx512 = SURFCONV_KERNELS(avx512);
+#endif
 
 const std::vector<const Kernels*>& runnable() {
   static const std::vector<const Kernels*> list = [] {

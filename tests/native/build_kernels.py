@@ -33,7 +33,8 @@ def build() -> Path:
     import pybind11
 
     module = FOLDER / f"{NAME}{sysconfig.get_config_var('EXT_SUFFIX')}"
-    objects = sorted(FOLDER.glob("csrc/cpu/*.o"))
+    sources = sorted(path.relative_to(ROOT) for path in ROOT.glob("csrc/cpu/**/*.cpp"))
+    objects = [(FOLDER / path).with_suffix(".o") for path in sources]
     newest = max(path.stat().st_mtime for path in [SOURCE, *objects])
     with (FOLDER / "tests.lock").open("w", encoding="utf-8") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)

@@ -290,11 +290,3 @@ void run_backward(const Conv& conv, const BackwardTensors& tensors, const Execut
     Backward<T>(conv, tensors, executor).run();
   }
 }
-
-void backward(const Conv& conv, const BackwardTensors& tensors, const Executor& executor) {
-  if (tensors.input.dtype == DType::f64) {
-    run_backward<double>(conv, tensors, executor);
-  } else {
-    run_backward<float>(conv, tensors, executor);
-  }
-}

@@ -205,5 +205,6 @@ inline void avg_pool_backward(const Pool& pool, const PoolBackwardTensors& tenso
                                     : avg_pool_backward_of<float>(pool, tensors, executor);
 }
 
-inline constexpr PoolKernels pool_kernels = {max_pool_forward, max_pool_backward, avg_pool_forward,
-                                             avg_pool_backward};
+extern const PoolKernels pool_kernels;
+const PoolKernels pool_kernels = {max_pool_forward, max_pool_backward, avg_pool_forward,
+                                  avg_pool_backward};

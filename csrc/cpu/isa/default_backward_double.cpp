@@ -1,0 +1,3 @@
+#define SURFCONV_UNIT "../kernel/unit_backward.inl"
+#define SURFCONV_DOUBLE
+#include "default.inl"

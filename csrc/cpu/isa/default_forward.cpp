@@ -1,0 +1,2 @@
+#define SURFCONV_UNIT "../kernel/unit_forward.inl"
+#include "default.inl"

@@ -1,0 +1,21 @@
+// The convolution's forward, included once per instruction set, see cpu/isa.
+namespace surfconv::cpu::SURFCONV_ISA {
+
+#include "vec.inl"
+#include "workspace.inl"
+#include "pixels.inl"
+#include "guide.inl"
+#include "samples.inl"
+#include "tile.inl"
+#include "gemm.inl"
+#include "lanewise.inl"
+#include "blocks.inl"
+#include "passes.inl"
+#include "walk.inl"
+#include "gather.inl"
+#include "lane_forward.inl"
+#include "pointwise_pixels.inl"
+#include "pointwise.inl"
+#include "forward.inl"
+
+}  // namespace surfconv::cpu::SURFCONV_ISA
