@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any, Literal, TypeVar
 
 from numpy.typing import NDArray
@@ -24,12 +24,12 @@ Depths = TypeVar("Depths", Tensor, NDArray[Any])
 
 
 def check_integer(value: Any, name: str, minimum: int) -> int:
-    """An integer of at least ``minimum``."""
-    if isinstance(value, bool) or not isinstance(value, int):
+    """An integer of at least ``minimum``, NumPy's included."""
+    if isinstance(value, bool) or not isinstance(value, (int, Integral)):
         raise TypeError(f"{name}: expected an integer, got {value!r} of type {type_name(value)}")
     if value < minimum:
         raise ValueError(f"{name}: expected at least {minimum}, got {value}")
-    return value
+    return int(value)
 
 
 def check_pair(value: Any, name: str, minimum: int) -> Pair:
@@ -39,7 +39,7 @@ def check_pair(value: Any, name: str, minimum: int) -> Pair:
         y, x = value
         if y >= minimum and x >= minimum:
             return y, x
-    if isinstance(value, int):
+    if isinstance(value, (int, Integral)):
         single = check_integer(value, name, minimum)
         return single, single
     if not isinstance(value, (tuple, list)):

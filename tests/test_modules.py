@@ -8,6 +8,7 @@ import pickle
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -40,6 +41,15 @@ def depth_map(*shape: int) -> Tensor:
 
 
 @pytest.mark.core
+def test_sizes_that_numpy_computed() -> None:
+    two, three = np.int64(2), np.int32(3)
+    layer = SurfConv2d(three, 4, three, two, np.int8(1), reference_depth=2.0)
+    x, depth = torch.randn(1, 3, 8, 9), torch.rand(1, 8, 9) + 1.0
+    plain = SurfConv2d(3, 4, 3, 2, 1, reference_depth=2.0)
+    plain.load_state_dict(layer.state_dict())
+    assert_same_bits(layer(x, depth), plain(x, depth))
+
+
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     "shape",
