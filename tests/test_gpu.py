@@ -154,11 +154,12 @@ def test_gradients_of_more_than_2_to_the_31_elements() -> None:
     results = []
     for first in (0, rows - 32):
         near, at = (t[..., first:, :].detach().requires_grad_() for t in (x, scale))
-        out = surf_conv2d(near, weight, scale=at, padding=1, groups=channels)
+        filters = weight.detach().requires_grad_()
+        out = surf_conv2d(near, filters, scale=at, padding=1, groups=channels)
         # One row alone pulls, so that the crop's own upper rim adds nothing.
         pull = torch.zeros_like(out)
         pull[:, :, -8] = 1
-        grads = torch.autograd.grad(out, (near, at), pull)
+        grads = torch.autograd.grad(out, (near, at, filters), pull)
         results.append([grad[..., -16:, :].float() for grad in grads])
     for whole, crop in zip(*results, strict=True):
         torch.testing.assert_close(whole, crop, rtol=1e-2, atol=1e-2)

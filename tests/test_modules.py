@@ -40,7 +40,6 @@ def depth_map(*shape: int) -> Tensor:
     return depth
 
 
-@pytest.mark.core
 def test_sizes_that_numpy_computed() -> None:
     two, three = np.int64(2), np.int32(3)
     layer = SurfConv2d(three, 4, three, two, np.int8(1), reference_depth=2.0)
@@ -50,6 +49,7 @@ def test_sizes_that_numpy_computed() -> None:
     assert_same_bits(layer(x, depth), plain(x, depth))
 
 
+@pytest.mark.core
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize(
     "shape",

@@ -14,8 +14,8 @@ from .backward_weight import backward_weight_kernel
 from .conv import Conv, tensor_float32
 from .tiles import Tiles, data_tiles, fastest, weight_tiles
 
-#: Programs that sum the gradient of the weight. Not the device's own number: what is added to
-#: what, and so the last bit, is to depend on the shapes alone.
+#: Programs that sum the gradient of the weight. Not the device's own number: where torch asks for
+#: deterministic algorithms, what is added to what is to depend on the shapes alone.
 _WEIGHT_PROGRAMS = 1024
 #: Sums that are wider than the gradient they become may take this share of input and output, or
 #: what is so little that more launches cost more than it, or one image's.

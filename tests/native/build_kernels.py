@@ -19,9 +19,15 @@ SANITIZE = os.environ.get("SURFCONV_SANITIZE", "0") not in ("", "0")
 FOLDER = ROOT / "build" / ("native-sanitize" if SANITIZE else "native")
 
 
+def objects() -> list[Path]:
+    """One of each source of the kernels."""
+    sources = sorted(path.relative_to(ROOT) for path in ROOT.glob("csrc/cpu/**/*.cpp"))
+    return [(FOLDER / path).with_suffix(".o") for path in sources]
+
+
 def why_not() -> str | None:
     """What is missing to build the module."""
-    if not (FOLDER / "csrc" / "cpu").is_dir():
+    if not all(path.is_file() for path in objects()):
         return "no compiled operator was built in this source tree: run make build"
     if not (Path(sysconfig.get_path("include")) / "Python.h").is_file():
         return "Python's C headers are not installed"
@@ -33,9 +39,7 @@ def build() -> Path:
     import pybind11
 
     module = FOLDER / f"{NAME}{sysconfig.get_config_var('EXT_SUFFIX')}"
-    sources = sorted(path.relative_to(ROOT) for path in ROOT.glob("csrc/cpu/**/*.cpp"))
-    objects = [(FOLDER / path).with_suffix(".o") for path in sources]
-    newest = max(path.stat().st_mtime for path in [SOURCE, *objects])
+    newest = max(path.stat().st_mtime for path in [SOURCE, *objects()])
     with (FOLDER / "tests.lock").open("w", encoding="utf-8") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if module.is_file() and module.stat().st_mtime > newest:
@@ -49,7 +53,7 @@ def build() -> Path:
             *flags,
             *(f"-I{folder}" for folder in includes),
             str(SOURCE),
-            *map(str, objects),
+            *map(str, objects()),
             "-o",
             str(module),
         ]
