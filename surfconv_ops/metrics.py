@@ -16,6 +16,7 @@ from .checks import (
     check_depth_ranges,
     check_depth_tensor,
     check_integer,
+    check_optional_integer,
     type_name,
     valid_depth,
 )
@@ -78,14 +79,7 @@ class SegmentationMetrics:
         depth_ranges: Sequence[float] | None = DEPTH_RANGES,
     ) -> None:
         self.num_classes = check_integer(num_classes, "num_classes", 1)
-        if ignore_index is not None and (
-            isinstance(ignore_index, bool) or not isinstance(ignore_index, int)
-        ):
-            raise TypeError(
-                f"ignore_index: expected an integer or None, got {ignore_index!r} of type"
-                f" {type_name(ignore_index)}"
-            )
-        self.ignore_index = ignore_index
+        self.ignore_index = check_optional_integer(ignore_index, "ignore_index")
         self.depth_ranges = check_depth_ranges(depth_ranges)
         self.reset()
 

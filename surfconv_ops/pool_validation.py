@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from . import geometry
-from .checks import PairArgument, check_not_negative, check_pair, type_name
+from .checks import PairArgument, check_not_negative, check_optional_integer, check_pair
 from .geometry import Pair
 from .validation import Window, as_batch, check_guide, check_scale, check_tensors
 
@@ -35,16 +35,10 @@ class PoolWindow(Window):
 
 def check_divisor(divisor_override: Any) -> int | None:
     """An integer other than zero, or None."""
-    if divisor_override is None:
-        return None
-    if isinstance(divisor_override, bool) or not isinstance(divisor_override, int):
-        raise TypeError(
-            f"divisor_override: expected an integer or None, got {divisor_override!r} of type"
-            f" {type_name(divisor_override)}"
-        )
-    if divisor_override == 0:
+    divisor = check_optional_integer(divisor_override, "divisor_override")
+    if divisor == 0:
         raise ValueError("divisor_override: expected an integer other than zero, got 0")
-    return divisor_override
+    return divisor
 
 
 def check_pool_window(

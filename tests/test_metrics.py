@@ -293,6 +293,12 @@ def test_json_and_pickle() -> None:
     assert copy.compute()["pixels"] == 2 * figures["pixels"]
 
 
+def test_numbers_that_numpy_computed() -> None:
+    inputs = problem(4, 2, seed=1)
+    figures = counted(inputs, 4, 2).compute()
+    assert repr(counted(inputs, np.int64(4), np.int32(2)).compute()) == repr(figures)
+
+
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("deterministic", [False, True])

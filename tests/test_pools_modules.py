@@ -7,6 +7,7 @@ import pickle
 import warnings
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
@@ -174,6 +175,14 @@ CONSTRUCTION: dict[str, tuple[dict[str, Any], type[Exception], list[str]]] = {
 def test_construction(kind: Any, case: str) -> None:
     change, error, words = CONSTRUCTION[case]
     says(error, words, lambda: kind(**({"kernel_size": 3, "reference_depth": 1.0} | change)))
+
+
+def test_numbers_that_numpy_computed() -> None:
+    two, three = np.int64(2), np.int32(3)
+    layer = SurfAvgPool2d(three, two, np.int8(1), divisor_override=two, reference_depth=2.0)
+    x, depth = torch.randn(1, 3, 8, 9), torch.rand(1, 8, 9) + 1.0
+    plain = SurfAvgPool2d(3, 2, 1, divisor_override=2, reference_depth=2.0)
+    assert_same_bits(layer(x, depth), plain(x, depth))
 
 
 def test_construction_of_one_kind() -> None:
