@@ -60,6 +60,21 @@ def test_kernels(place: str, kernel: int | tuple[int, int]) -> None:
     check(lay_scale(make_problem(1, 4, 5, SIZE, kernel, padding=padding), place))
 
 
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("kernel", [3, 7, (4, 3), 9])
+@pytest.mark.parametrize(
+    ("channels", "out_channels"), [(1, 1), (3, 4), (4, 4), (5, 1), (6, 4), (7, 8), (8, 3), (8, 8)]
+)
+def test_few_channels(
+    place: str, kernel: int | tuple[int, int], channels: int, out_channels: int
+) -> None:
+    """Up to eight of both, contracted without a gathered matrix where no more taps than fit it."""
+    problem = make_problem(
+        2, channels, out_channels, SIZE, kernel, padding=2, layout="channels_last"
+    )
+    check(lay_scale(problem, place))
+
+
 @pytest.mark.parametrize("channels", [44, 64])
 @pytest.mark.parametrize("out_channels", [5, 16, 33])
 def test_blocks_of_taps(channels: int, out_channels: int) -> None:
@@ -136,9 +151,10 @@ def test_depthwise_dtypes(dtype: torch.dtype, place: str, channels: int) -> None
 
 
 @pytest.mark.parametrize("guide", ["levels", "depth", "holes"])
-@pytest.mark.parametrize("channels", [4, 16, 20])
-def test_guides(guide: str, channels: int) -> None:
-    problem = make_problem(1, channels, 6, SIZE, guide=guide, guide_tolerance=1.0)
+@pytest.mark.parametrize("channels", [4, 6, 16, 20])
+@pytest.mark.parametrize("out_channels", [3, 6])
+def test_guides(guide: str, channels: int, out_channels: int) -> None:
+    problem = make_problem(1, channels, out_channels, SIZE, guide=guide, guide_tolerance=1.0)
     check(lay_scale(problem, "holes"))
 
 

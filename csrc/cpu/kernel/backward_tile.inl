@@ -31,7 +31,8 @@ class BackwardTile {
         units_(make_units(blocks_, kBlock)),
         taps_(taps_at_once(conv, std::min(kBlock, to_quads(plan_.channels)))),
         swapped_(!plan_.lanewise &&
-                 round_up(plan_.outputs, kSwappedRows) < pad_width<T>(plan_.outputs)),
+                 (plan_.outputs <= kSwappedRows ||
+                  round_up(plan_.outputs, kSwappedRows) < pad_width<T>(plan_.outputs))),
         output_(conv, plan_, tensors.grad_output),
         width_(output_.width()),
         ld_rows_(
@@ -222,10 +223,11 @@ class BackwardTile {
     const int64_t ld = gradients.ld;
     if (!plan_.lanewise) {
       // What pads the matrix would else add whatever lies there.
+      using Quad = Vec<T, kQuad>;
       const int64_t used = taps * block.padded;
       const int64_t padded = swapped_ ? pad_width<T>(used) : round_up(used, kRowPad);
-      for (int m = 0; padded > used && m < count; ++m) {
-        std::fill(scratch.rows + m * ld_rows_ + used, scratch.rows + m * ld_rows_ + padded, T(0));
+      for (int64_t column = used; column < padded; column += kQuad) {
+        for (int m = 0; m < count; ++m) store(scratch.rows + m * ld_rows_ + column, Quad{});
       }
       if (swapped_) {
         gemm_transposed<T, kSwappedRows>(round_up(plan_.outputs, kSwappedRows), used, count, from,
@@ -259,7 +261,7 @@ class BackwardTile {
   const std::vector<ChannelBlock> blocks_;
   const std::vector<Unit> units_;
   const int64_t taps_;
-  const bool swapped_;  // partial grad_weight as [output][tap, channel]: few outputs, less padding
+  const bool swapped_;  // partial grad_weight as [output][tap, channel]: few outputs, fuller vectors
   const OutputGradient<T> output_;
   const int64_t width_, ld_rows_;
   const bool needs_matrix_;

@@ -10,7 +10,10 @@ class Forward {
         plan_(conv),
         blocks_(channel_blocks(plan_, kBlock)),
         taps_(taps_at_once(conv, std::min(kBlock, to_quads(plan_.channels)))),
-        width_(plan_.lanewise ? plan_.multiplier * plan_.row : pad_width<T>(plan_.outputs)),
+        few_(few_of<T>(plan_, taps_)),
+        width_(few_             ? few_.outputs
+               : plan_.lanewise ? plan_.multiplier * plan_.row
+                                : pad_width<T>(plan_.outputs)),
         ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
         input_(conv, plan_, tensors.input),
         guide_(conv, tensors.guide),
@@ -95,6 +98,10 @@ class Forward {
       weights_ = pack_lanewise<T, false>(conv_, plan_, tensors_.weight);
       return;
     }
+    if (few_) {
+      weights_ = pack_few<T>(few_, plan_, tensors_.weight, conv_.x.kernel);
+      return;
+    }
     const int64_t depth = plan_.taps * plan_.row;
     weights_ = Buffer<T>(depth * width_);
     const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
@@ -117,7 +124,7 @@ class Forward {
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
     scratch.tile.place(tensors_.scale, guide_.image(n), n, begin, count, steps_y, steps_x);
     // Straight into the output where whole blocks of the product fit there.
-    const bool direct = writes_rows_ && (fused_ || count % kRowPad == 0);
+    const bool direct = writes_rows_ && (fused_ || few_ || count % kRowPad == 0);
     const int64_t ld_out = direct ? tensors_.output.x : plan_.groups * width_;
     T* out = direct ? static_cast<T*>(tensors_.output.data) + n * tensors_.output.n +
                           begin * tensors_.output.x
@@ -127,7 +134,15 @@ class Forward {
       lane_forward(conv_, plan_, scratch.tile, scratch.lanes, base, steps_y.read, steps_x.read,
                    weights_.get(), initial_.data(), out, ld_out);
     }
-    const bool gathers = !fused_ || (scratch.tile.guided() && scratch.tile.has(Place::other));
+    if (few_) {
+      if (scratch.tile.has(Place::other)) {
+        scratch.tile.template fill_taps<false, Slopes::none>(0, plan_.taps, unseen, 0);
+      }
+      few_forward(few_, FewTile<T>{conv_, scratch.tile, base, weights_.get(), initial_.data(), out,
+                                   ld_out});
+    }
+    const bool gathers =
+        !few_ && (!fused_ || (scratch.tile.guided() && scratch.tile.has(Place::other)));
     if (plan_.lanewise && gathers) {
       for_gathered_runs(scratch.tile, count, [&](const Run& run) {
         for (int m = run.begin; m < run.end; ++m) {
@@ -213,7 +228,9 @@ class Forward {
   const Executor& executor_;
   const Plan plan_;
   const std::vector<ChannelBlock> blocks_;
-  const int64_t taps_, width_, ld_rows_;
+  const int64_t taps_;
+  const Few few_;
+  const int64_t width_, ld_rows_;
   InputRows<T> input_;
   GuideRows<T> guide_;
   const bool fused_;  // lanewise without a gathered matrix, but where a guide hides corners

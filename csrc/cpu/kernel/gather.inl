@@ -1,6 +1,6 @@
 // sink(c, sum over corners of weight * x), vector by vector
-template <int CORNERS, class T, class Channels, class Sink>
-SURFCONV_INLINE void blend(const T* const* from, const T* weight, Channels channels,
+template <int CORNERS, class T, class W, class Channels, class Sink>
+SURFCONV_INLINE void blend(const T* const* from, const W* weight, Channels channels,
                            const Sink& sink) {
   for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
     using V = Vec<T, decltype(width)::lanes>;
@@ -13,12 +13,12 @@ SURFCONV_INLINE void blend(const T* const* from, const T* weight, Channels chann
 
 // One tap of an interior pixel. One vector of channels: along the rows first, so that the weights
 // of the two axes are enough; more: each corner's weight is worth a product of its own.
-template <int ROWS, int COLUMNS, class T, class Channels, class Sink>
-SURFCONV_INLINE void sample_tap(const char* base, const TapSide<T>& y, const TapSide<T>& x,
+template <int ROWS, int COLUMNS, class T, class W, class Channels, class Sink>
+SURFCONV_INLINE void sample_tap(const char* base, const TapSide<W>& y, const TapSide<W>& x,
                                 Channels channels, const Sink& sink) {
-  const auto corners = corners_of<ROWS, COLUMNS>(base, y, x);
+  const auto corners = corners_of<ROWS, COLUMNS, T>(base, y, x);
   if constexpr (ROWS == 2 && COLUMNS == 2 && is_one_vector<T>(Channels{})) {
-    using V = Vec<T, static_cast<int>(Channels::value)>;
+    using V = W;
     const T* const* from = corners.from;
     const V upper = load<V>(from[0]) * x.weight[0] + load<V>(from[1]) * x.weight[1];
     const V lower = load<V>(from[2]) * x.weight[0] + load<V>(from[3]) * x.weight[1];
@@ -28,23 +28,28 @@ SURFCONV_INLINE void sample_tap(const char* base, const TapSide<T>& y, const Tap
   }
 }
 
+// One tap of a pixel whose corners are listed.
+template <int CORNERS, class T, class Channels, class Sink>
+SURFCONV_INLINE void blend_listed(const TapCorners<T>& tap, const char* base, int m,
+                                  Channels channels, const Sink& sink) {
+  const T* from[CORNERS];
+  T weight[CORNERS];
+#pragma GCC unroll 4
+  for (int q = 0; q < CORNERS; ++q) {
+    from[q] = reinterpret_cast<const T*>(base + tap.read[q * kTile + m]);
+    weight[q] = tap.weight[q * kTile + m];
+  }
+  blend<CORNERS>(from, weight, channels, sink);
+}
+
 // Pixels begin .. end-1 of the tile, m of them at to + m * ld.
 template <class T, int CORNERS, class Channels>
-void gather_corners(const TapCorners<T>& tap, const char* base, int begin, int end,
-                    Channels channels, T* __restrict to, int64_t ld) {
-  const int64_t* __restrict read = tap.read;
-  const T* __restrict weights = tap.weight;
+void gather_corners(TapCorners<T> tap, const char* base, int begin, int end, Channels channels,
+                    T* __restrict to, int64_t ld) {
   for (int m = begin; m < end; ++m) {
-    const T* from[CORNERS];
-    T weight[CORNERS];
-#pragma GCC unroll 4
-    for (int q = 0; q < CORNERS; ++q) {
-      from[q] = reinterpret_cast<const T*>(base + read[q * kTile + m]);
-      weight[q] = weights[q * kTile + m];
-    }
     T* row = to + m * ld;
-    blend<CORNERS>(from, weight, channels,
-                   [&](int64_t c, auto sum) SURFCONV_INLINED { store(row + c, sum); });
+    blend_listed<CORNERS>(tap, base, m, channels,
+                          [&](int64_t c, auto sum) SURFCONV_INLINED { store(row + c, sum); });
   }
 }
 
@@ -69,17 +74,18 @@ template <int KX, class T, class Channels>
 void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
                      const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
                      int64_t step) {
+  using W = typename WeightOf<T, Channels>::type;
   const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
     T* out = to + m * ld;
-    walk_taps<KX>(axis_y, axis_x, rows, columns, taps_y, m,
-                  [&](auto r, auto c, const TapSide<T>& y, const TapSide<T>& x, int64_t t)
-                      SURFCONV_INLINED {
-                        T* place = out + t * step;
-                        sample_tap<decltype(r)::value, decltype(c)::value>(
-                            base, y, x, channels,
-                            [&](int64_t at, auto sum) SURFCONV_INLINED { store(place + at, sum); });
-                      });
+    walk_taps<KX, W>(
+        axis_y, axis_x, rows, columns, taps_y, m,
+        [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t) SURFCONV_INLINED {
+          T* place = out + t * step;
+          sample_tap<decltype(r)::value, decltype(c)::value, T>(
+              base, y, x, channels,
+              [&](int64_t at, auto sum) SURFCONV_INLINED { store(place + at, sum); });
+        });
   }
 }
 

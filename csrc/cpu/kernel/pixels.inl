@@ -170,10 +170,19 @@ SURFCONV_INLINE void for_runs(const View& view, int64_t width, int64_t first, in
 
 constexpr int64_t kStage = 64;  // pixels converted at a time between half types and transposes
 
-// Pixels whose channels lie side by side on both ends.
+// Pixels whose channels, a quad or more, lie side by side on both ends.
 template <class T>
 void copy_pixels(const T* from, int64_t from_step, int64_t channels, int64_t count, T* to,
                  int64_t to_step) {
+  if (channels % kQuad != 0) {
+    using Quad = Vec<T, kQuad>;
+    const int64_t last = channels - kQuad;  // overlaps the quad before it
+    for (int64_t p = 0; p < count; ++p, from += from_step, to += to_step) {
+      for (int64_t c = 0; c < last; c += kQuad) store(to + c, load<Quad>(from + c));
+      store(to + last, load<Quad>(from + last));
+    }
+    return;
+  }
   with_channels<T>(channels, [&](auto known) {
     for (int64_t p = 0; p < count; ++p) {
       for_channels<T>(known, [&](int64_t c, auto width) SURFCONV_INLINED {
@@ -195,7 +204,7 @@ void load_pixels(const View& view, int64_t n, int64_t first_channel, int64_t cha
       const S* from = origin + offset;
       T* rows = to + done * ld;
       if constexpr (std::is_same_v<S, T>) {
-        if (view.c == 1 && channels % kQuad == 0) {
+        if (view.c == 1 && channels >= kQuad) {
           return copy_pixels(from, view.x, channels, run, rows, ld);
         }
       }
@@ -232,10 +241,9 @@ void load_pixels(const View& view, int64_t n, int64_t first_channel, int64_t cha
       }
     });
   });
-  if (padded > channels) {
-    for (int64_t p = 0; p < count; ++p) {
-      for (int64_t c = channels; c < padded; ++c) to[p * ld + c] = 0;
-    }
+  // Channel by channel: the few of a pixel would be a call of memset each.
+  for (int64_t c = channels; c < padded; ++c) {
+    for (int64_t p = 0; p < count; ++p) to[p * ld + c] = 0;
   }
 }
 
@@ -249,7 +257,7 @@ void store_pixels(const View& view, int64_t n, int64_t first_channel, int64_t ch
       S* to = origin + offset;
       const T* rows = from + done * ld;
       if constexpr (std::is_same_v<S, T>) {
-        if (view.c == 1 && channels % kQuad == 0) {
+        if (view.c == 1 && channels >= kQuad) {
           return copy_pixels(rows, ld, channels, run, to, view.x);
         }
       }

@@ -51,9 +51,10 @@ class PixelDot {
 
 // One tap of one pixel from the weight and slope of each corner. With Kinked, corners of zero
 // weight hold a real pixel for the derivative's sake and must not touch the sample: 0 * inf.
-template <int CORNERS, bool Writes, Slopes S, bool Kinked, class T, class Channels, class Dot>
-SURFCONV_INLINE void scatter_corners(const T* const* from, T* const* to, const T* weight,
-                                     const T* slope, const T* slope_x, Channels channels, T* row,
+template <int CORNERS, bool Writes, Slopes S, bool Kinked, class T, class W, class Channels,
+          class Dot>
+SURFCONV_INLINE void scatter_corners(const T* const* from, T* const* to, const W* weight,
+                                     const W* slope, const W* slope_x, Channels channels, T* row,
                                      Dot& dot) {
   for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
     using V = Vec<T, decltype(width)::lanes>;
@@ -63,6 +64,7 @@ SURFCONV_INLINE void scatter_corners(const T* const* from, T* const* to, const T
     for (int q = 0; q < CORNERS; ++q) {
       const V x = load<V>(from[q] + c);
       if constexpr (Kinked) {
+        static_assert(std::is_same_v<T, W>, "weights that can be asked whether they are zero");
         if (weight[q] != 0) sample += x * weight[q];
       } else {
         sample += x * weight[q];

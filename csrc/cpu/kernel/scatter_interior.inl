@@ -3,10 +3,9 @@
 
 // One tap in two rows and two columns, one vector of channels: along the rows first, so that the
 // weights of the two axes are enough.
-template <bool Writes, Slopes S, class T, class Channels, class Dot>
-SURFCONV_INLINE void scatter_square(const T* const* from, T* const* to, const TapSide<T>& y,
-                                    const TapSide<T>& x, Channels, T* row, Dot& dot) {
-  using V = Vec<T, static_cast<int>(Channels::value)>;
+template <bool Writes, Slopes S, class T, class V, class Dot>
+SURFCONV_INLINE void scatter_square(const T* const* from, T* const* to, const TapSide<V>& y,
+                                    const TapSide<V>& x, T* row, Dot& dot) {
   const V gradient = load<V>(row);
   const V x00 = load<V>(from[0]), x01 = load<V>(from[1]);
   const V x10 = load<V>(from[2]), x11 = load<V>(from[3]);
@@ -32,24 +31,24 @@ SURFCONV_INLINE void scatter_square(const T* const* from, T* const* to, const Ta
   store(row, V(upper * y.weight[0] + lower * y.weight[1]));
 }
 
-template <int ROWS, int COLUMNS, bool Writes, Slopes S, class T, class Channels, class Dot>
-SURFCONV_INLINE void scatter_place(const ScatterTarget<T>& target, const TapSide<T>& y,
-                                   const TapSide<T>& x, Channels channels, T* row, Dot& dot) {
+template <int ROWS, int COLUMNS, bool Writes, Slopes S, class T, class W, class Channels, class Dot>
+SURFCONV_INLINE void scatter_place(const ScatterTarget<T>& target, const TapSide<W>& y,
+                                   const TapSide<W>& x, Channels channels, T* row, Dot& dot) {
   constexpr int CORNERS = ROWS * COLUMNS;
-  const auto corners = corners_of<ROWS, COLUMNS>(target.read, y, x);
+  const auto corners = corners_of<ROWS, COLUMNS, T>(target.read, y, x);
   T* to[CORNERS] = {};
-  T slope[CORNERS], slope_x[CORNERS];
+  W slope[CORNERS], slope_x[CORNERS];
 #pragma GCC unroll 4
   for (int q = 0; q < CORNERS; ++q) {
     const int i = q / COLUMNS, j = q % COLUMNS;
     if constexpr (Writes) to[q] = reinterpret_cast<T*>(target.write + y.write[i] + x.read[j]);
-    const T along_y = ROWS == 1 ? T(0) : (i == 0 ? -y.tap : y.tap) * x.weight[j];
-    const T along_x = COLUMNS == 1 ? T(0) : (j == 0 ? -x.tap : x.tap) * y.weight[i];
+    const W along_y = ROWS == 1 ? W{} : (i == 0 ? -y.tap : y.tap) * x.weight[j];
+    const W along_x = COLUMNS == 1 ? W{} : (j == 0 ? -x.tap : x.tap) * y.weight[i];
     slope[q] = S == Slopes::one ? along_y + along_x : along_y;
     slope_x[q] = along_x;
   }
   if constexpr (CORNERS == 4 && is_one_vector<T>(Channels{})) {
-    scatter_square<Writes, S>(corners.from, to, y, x, channels, row, dot);
+    scatter_square<Writes, S>(corners.from, to, y, x, row, dot);
   } else {
     scatter_corners<CORNERS, Writes, S, false>(corners.from, to, corners.weight, slope, slope_x,
                                                channels, row, dot);
@@ -61,12 +60,13 @@ template <bool Writes, Slopes S, int KX, class T, class Channels>
 void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
                       ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
                       int64_t ld) {
+  using W = typename WeightOf<T, Channels>::type;
   const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
     PixelDot<T, Channels> dot(target, m);
     T* row = matrix + m * ld;
-    walk_taps<KX>(axis_y, axis_x, rows, columns, taps_y, m,
-                  [&](auto r, auto c, const TapSide<T>& y, const TapSide<T>& x, int64_t t)
+    walk_taps<KX, W>(axis_y, axis_x, rows, columns, taps_y, m,
+                  [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t)
                       SURFCONV_INLINED {
                         scatter_place<decltype(r)::value, decltype(c)::value, Writes, S>(
                             target, y, x, channels, row + t * count_of(channels), dot);

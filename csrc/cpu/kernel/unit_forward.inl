@@ -14,6 +14,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "walk.inl"
 #include "gather.inl"
 #include "lane_forward.inl"
+#include "few_forward.inl"
 #include "pointwise_pixels.inl"
 #include "pointwise.inl"
 #include "forward.inl"
