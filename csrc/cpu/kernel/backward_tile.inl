@@ -127,7 +127,7 @@ class BackwardTile {
       with_needs(target, [&](auto writes, auto slopes) {
         constexpr bool Writes = decltype(writes)::value;
         constexpr Slopes S = decltype(slopes)::value;
-        if (scratch.tile.has(Place::other)) {
+        if (scratch.tile.needs_list()) {
           scratch.tile.template fill_taps<Writes, S>(first_tap, taps, unseen_read, unseen_write);
         }
         T* weight = target.weight;
@@ -140,8 +140,9 @@ class BackwardTile {
             char* write = nullptr;
             if constexpr (Writes)
               write = target.grad_input + channel * static_cast<int64_t>(sizeof(T));
-            const ScatterTarget<T> to{read, write, scratch.dot, scratch.dot + kTile * kLanes<T>,
-                                      zeros_.data()};
+            const ScatterTarget<T> to{read,          write,
+                                      scratch.dot,   scratch.dot + kTile * kLanes<T>,
+                                      zeros_.data(), scratch.discard};
             scatter_tile<Writes, S>(conv_, scratch.tile, first_tap, taps, to, block.padded,
                                     scratch.rows, ld_rows_);
           } else {
@@ -261,7 +262,8 @@ class BackwardTile {
   const std::vector<ChannelBlock> blocks_;
   const std::vector<Unit> units_;
   const int64_t taps_;
-  const bool swapped_;  // partial grad_weight as [output][tap, channel]: few outputs, fuller vectors
+  const bool
+      swapped_;  // partial grad_weight as [output][tap, channel]: few outputs, fuller vectors
   const OutputGradient<T> output_;
   const int64_t width_, ld_rows_;
   const bool needs_matrix_;

@@ -113,12 +113,33 @@ void few_grid(FewTile<T> few, const Run& run) {
   const AxisTable<T> rows = few.tile.rows(), columns = few.tile.columns();
   for (int m = run.begin; m < run.end; ++m) {
     FewSums<T, LANES, OUTPUTS> sums;
-    walk_grid<KX>(
-        axis_y, axis_x, rows, columns, {0, axis_y.kernel}, m,
-        [&](auto, auto, const GridSide<T>& y, const GridSide<T>& x, int64_t t) SURFCONV_INLINED {
-          const T* from = reinterpret_cast<const T*>(few.base + y.read + x.read);
-          sums.add(load<Vec<T, LANES>>(from), few, t);
-        });
+    walk_grid<KX>(axis_y, axis_x, rows, columns, {0, axis_y.kernel}, m,
+                  [&](auto, auto, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
+                      SURFCONV_INLINED {
+                        const T* from = reinterpret_cast<const T*>(few.base + y.read + x.read);
+                        sums.add(load<Vec<T, LANES>>(from), few, t);
+                      });
+    sums.finish(few, m);
+  }
+}
+
+// Pixels of which part may lie outside the image.
+template <int LANES, int OUTPUTS, class T>
+void few_seen(FewTile<T> few, const Run& run) {
+  const Axis axis_y = few.conv.y, axis_x = few.conv.x;
+  const AxisTable<T> rows = few.tile.rows(), columns = few.tile.columns();
+  for (int m = run.begin; m < run.end; ++m) {
+    FewSums<T, LANES, OUTPUTS> sums;
+    walk_seen<false, Slopes::none>(axis_y, axis_x, rows, columns, {0, axis_y.kernel}, m,
+                                   [&](auto r, auto c, const SeenSide<T>& y, const SeenSide<T>& x,
+                                       int64_t t) SURFCONV_INLINED {
+                                     if constexpr (decltype(r)::value > 0) {
+                                       blend_seen<decltype(r)::value, decltype(c)::value>(
+                                           few.base, y, x, Fixed<LANES>{},
+                                           [&](int64_t, Vec<T, LANES> sample)
+                                               SURFCONV_INLINED { sums.add(sample, few, t); });
+                                     }
+                                   });
     sums.finish(few, m);
   }
 }
@@ -131,9 +152,9 @@ void few_listed(FewTile<T> few, const Run& run) {
     FewSums<T, LANES, OUTPUTS> sums;
     for (int64_t t = 0; t < taps; ++t) {
       const auto add = [&](auto corners) SURFCONV_INLINED {
-        blend_listed<decltype(corners)::value>(
-            few.tile.tap(t), few.base, m, Fixed<LANES>{},
-            [&](int64_t, Vec<T, LANES> sample) SURFCONV_INLINED { sums.add(sample, few, t); });
+        blend_listed<decltype(corners)::value>(few.tile.tap(t), few.base, m, Fixed<LANES>{},
+                                               [&](int64_t, Vec<T, LANES> sample)
+                                                   SURFCONV_INLINED { sums.add(sample, few, t); });
       };
       switch (few.tile.tap(t).corners) {
         case 1:
@@ -152,8 +173,11 @@ void few_listed(FewTile<T> few, const Run& run) {
 
 template <int LANES, int OUTPUTS, class T>
 void few_runs(const FewTile<T>& few) {
+  const bool listed = few.tile.needs_list();
   few.tile.for_runs([&](const Run& run) {
-    if (run.place == Place::other) return few_listed<LANES, OUTPUTS>(few, run);
+    if (run.place == Place::other) {
+      return listed ? few_listed<LANES, OUTPUTS>(few, run) : few_seen<LANES, OUTPUTS>(few, run);
+    }
     with_width(few.conv.x.kernel, [&](auto width) {
       constexpr int KX = decltype(width)::value;
       run.place == Place::on_grid ? few_grid<KX, LANES, OUTPUTS>(few, run)

@@ -135,7 +135,7 @@ class Forward {
                    weights_.get(), initial_.data(), out, ld_out);
     }
     if (few_) {
-      if (scratch.tile.has(Place::other)) {
+      if (scratch.tile.needs_list()) {
         scratch.tile.template fill_taps<false, Slopes::none>(0, plan_.taps, unseen, 0);
       }
       few_forward(few_, FewTile<T>{conv_, scratch.tile, base, weights_.get(), initial_.data(), out,
@@ -152,7 +152,7 @@ class Forward {
     }
     for (int64_t first_tap = 0; gathers && first_tap < plan_.taps; first_tap += taps_) {
       const int64_t taps = std::min(taps_, plan_.taps - first_tap);
-      if (scratch.tile.has(Place::other)) {
+      if (scratch.tile.needs_list()) {
         scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
       }
       for (const ChannelBlock& block : blocks_) {

@@ -28,6 +28,24 @@ SURFCONV_INLINE void sample_tap(const char* base, const TapSide<W>& y, const Tap
   }
 }
 
+// One tap of a pixel near the border: a sample of zeros where nothing of it is seen.
+template <int ROWS, int COLUMNS, class T, class Channels, class Sink>
+SURFCONV_INLINE void blend_seen(const char* base, const SeenSide<T>& y, const SeenSide<T>& x,
+                                Channels channels, const Sink& sink) {
+  if constexpr (ROWS == 0) {
+    for_channels<T>(channels, [&](int64_t c, auto width)
+                                  SURFCONV_INLINED { sink(c, Vec<T, decltype(width)::lanes>{}); });
+  } else {
+    const T* from[ROWS * COLUMNS];
+    T weight[ROWS * COLUMNS];
+    for_corners<ROWS, COLUMNS>([&](int q, int i, int j) SURFCONV_INLINED {
+      from[q] = reinterpret_cast<const T*>(base + y.read[i] + x.read[j]);
+      weight[q] = y.weight[i] * x.weight[j];
+    });
+    blend<ROWS * COLUMNS>(from, weight, channels, sink);
+  }
+}
+
 // One tap of a pixel whose corners are listed.
 template <int CORNERS, class T, class Channels, class Sink>
 SURFCONV_INLINE void blend_listed(const TapCorners<T>& tap, const char* base, int m,
@@ -108,6 +126,26 @@ void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows
   }
 }
 
+// Whole rows of taps of the pixels begin .. end-1, of which part may lie outside the image.
+template <class T, class Channels>
+void gather_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+                 const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
+                 int64_t step) {
+  const Axis axis_y = conv.y, axis_x = conv.x;
+  for (int m = begin; m < end; ++m) {
+    T* out = to + m * ld;
+    walk_seen<false, Slopes::none>(
+        axis_y, axis_x, rows, columns, taps_y, m,
+        [&](auto r, auto c, const SeenSide<T>& y, const SeenSide<T>& x, int64_t t)
+            SURFCONV_INLINED {
+              T* place = out + t * step;
+              blend_seen<decltype(r)::value, decltype(c)::value>(
+                  base, y, x, channels,
+                  [&](int64_t at, auto sum) SURFCONV_INLINED { store(place + at, sum); });
+            });
+  }
+}
+
 // The gathered matrix of a tile: `taps` from first_tap on, of `channels` each, a step apart, which
 // may be less than the channels: then a tap overwrites what pads the one before. Or only of the
 // pixels that need their corners listed.
@@ -116,8 +154,9 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
                  const char* base, int64_t channels, T* to, int64_t ld, int64_t step,
                  bool corners_only = false) {
   const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
+  const bool listed = tile.needs_list();
   tile.for_runs([&](const Run& run) {
-    if (run.place == Place::other) {
+    if (run.place == Place::other && listed) {
       for (int64_t t = 0; t < taps; ++t) {
         gather_tap(tile.tap(t), base, run.begin, run.end, channels, to + t * step, ld);
       }
@@ -125,6 +164,10 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
     }
     if (corners_only) return;
     with_channels<T>(channels, [&](auto known) {
+      if (run.place == Place::other) {
+        return gather_seen(conv, tile.rows(), tile.columns(), taps_y, base, run.begin, run.end,
+                           known, to, ld, step);
+      }
       with_width(conv.x.kernel, [&](auto width) {
         if (run.place == Place::on_grid) {
           return gather_grid<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y,

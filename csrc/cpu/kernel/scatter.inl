@@ -10,6 +10,7 @@ struct ScatterTarget {
   T* dot;
   T* dot_x;
   const T* zeros;  // what lies outside the image
+  T* discard;      // what nobody reads
 };
 
 // A pixel's partial sums while its taps are walked: in a register; the narrower vectors of a

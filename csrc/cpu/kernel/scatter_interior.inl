@@ -66,11 +66,11 @@ void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns,
     PixelDot<T, Channels> dot(target, m);
     T* row = matrix + m * ld;
     walk_taps<KX, W>(axis_y, axis_x, rows, columns, taps_y, m,
-                  [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t)
-                      SURFCONV_INLINED {
-                        scatter_place<decltype(r)::value, decltype(c)::value, Writes, S>(
-                            target, y, x, channels, row + t * count_of(channels), dot);
-                      });
+                     [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t)
+                         SURFCONV_INLINED {
+                           scatter_place<decltype(r)::value, decltype(c)::value, Writes, S>(
+                               target, y, x, channels, row + t * count_of(channels), dot);
+                         });
     if constexpr (S != Slopes::none) dot.finish();
     if constexpr (S == Slopes::two) dot.finish_x();
   }
@@ -122,13 +122,55 @@ void scatter_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Row
   }
 }
 
+// Whole rows of taps of the pixels begin .. end-1, of which part may lie outside the image.
+template <bool Writes, Slopes S, class T, class Channels>
+void scatter_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+                  ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
+                  int64_t ld) {
+  const Axis axis_y = conv.y, axis_x = conv.x;
+  for (int m = begin; m < end; ++m) {
+    PixelDot<T, Channels> dot(target, m);
+    T* row = matrix + m * ld;
+    walk_seen<Writes, S>(
+        axis_y, axis_x, rows, columns, taps_y, m,
+        [&](auto r, auto c, const SeenSide<T>& y, const SeenSide<T>& x, int64_t t)
+            SURFCONV_INLINED {
+              constexpr int ROWS = decltype(r)::value, COLUMNS = decltype(c)::value;
+              constexpr int CORNERS = ROWS * COLUMNS, PLACES = CORNERS + 1;
+              const T* from[PLACES];
+              T* to[PLACES] = {};
+              T weight[PLACES], slope[PLACES], slope_x[PLACES];
+              for_corners<ROWS, COLUMNS>([&](int q, int i, int j) SURFCONV_INLINED {
+                from[q] = reinterpret_cast<const T*>(target.read + y.read[i] + x.read[j]);
+                weight[q] = y.weight[i] * x.weight[j];
+                // A corner of zero weight is here for the slope alone.
+                if constexpr (Writes) {
+                  to[q] = weight[q] == 0
+                              ? target.discard
+                              : reinterpret_cast<T*>(target.write + y.write[i] + x.read[j]);
+                }
+                if constexpr (S != Slopes::none) {
+                  const T along_y = y.slope[i] * x.weight[j], along_x = x.slope[j] * y.weight[i];
+                  slope[q] = S == Slopes::one ? along_y + along_x : along_y;
+                  slope_x[q] = along_x;
+                }
+              });
+              scatter_corners<CORNERS, Writes, S, S != Slopes::none>(
+                  from, to, weight, slope, slope_x, channels, row + t * count_of(channels), dot);
+            });
+    if constexpr (S != Slopes::none) dot.finish();
+    if constexpr (S == Slopes::two) dot.finish_x();
+  }
+}
+
 // All pixels of a tile: `taps` from first_tap on, of `channels` each.
 template <bool Writes, Slopes S, class T>
 void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64_t taps,
                   const ScatterTarget<T>& target, int64_t channels, T* matrix, int64_t ld) {
   const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
+  const bool listed = tile.needs_list();
   tile.for_runs([&](const Run& run) {
-    if (run.place == Place::other) {
+    if (run.place == Place::other && listed) {
       for (int64_t t = 0; t < taps; ++t) {
         scatter_tap<Writes, S>(tile.tap(t), target, run.begin, run.end, channels,
                                matrix + t * channels, ld);
@@ -136,6 +178,10 @@ void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int6
       return;
     }
     with_channels<T>(channels, [&](auto known) {
+      if (run.place == Place::other) {
+        return scatter_seen<Writes, S>(conv, tile.rows(), tile.columns(), taps_y, target, run.begin,
+                                       run.end, known, matrix, ld);
+      }
       with_width(conv.x.kernel, [&](auto width) {
         constexpr int KX = decltype(width)::value;
         if (run.place == Place::on_grid) {

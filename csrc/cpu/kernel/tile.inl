@@ -32,6 +32,9 @@ class Tile {
 
   bool guided() const { return guide_.image != nullptr; }
 
+  // Whether some pixels are walked by their listed corners: a guide hides corners one by one.
+  bool needs_list() const { return has(Place::other) && (guided() || !has_whole_rows(conv_)); }
+
   template <class Body>
   SURFCONV_INLINE void for_runs(const Body& body) const {
     for (int i = 0; i < run_count_; ++i) body(runs_[i]);

@@ -13,6 +13,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "blocks.inl"
 #include "passes.inl"
 #include "walk.inl"
+#include "seen.inl"
 #include "gather.inl"
 #include "scatter.inl"
 #include "scatter_interior.inl"

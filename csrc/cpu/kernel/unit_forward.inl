@@ -12,6 +12,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "blocks.inl"
 #include "passes.inl"
 #include "walk.inl"
+#include "seen.inl"
 #include "gather.inl"
 #include "lane_forward.inl"
 #include "few_forward.inl"

@@ -8,7 +8,8 @@ struct WeightOf {
 };
 template <class T, int64_t N>
 struct WeightOf<T, Fixed<N>> {
-  using type = std::conditional_t<is_one_vector<T>(Fixed<N>{}), Vec<T, widest_lanes<T>(Fixed<N>{})>, T>;
+  using type =
+      std::conditional_t<is_one_vector<T>(Fixed<N>{}), Vec<T, widest_lanes<T>(Fixed<N>{})>, T>;
 };
 template <class W, class T>
 SURFCONV_INLINE W weight_of(T value) {

@@ -1,0 +1,69 @@
+// The taps of a pixel of which part may lie outside the image: only places inside are walked.
+
+// The places of a tap along one axis, none to two of them. Bytes.
+template <class T>
+struct SeenSide {
+  int64_t read[2];
+  int64_t write[2];  // of rows; columns lie in the gradient as in the input
+  T weight[2];
+  T slope[2];  // of the weight with the scale
+};
+
+// Returns how many places there are. For the slopes' sake those of zero weight count as well.
+template <bool Writes, Slopes S, class T>
+SURFCONV_INLINE int see(const Axis& axis, const AxisTable<T>& table, int64_t t, int m,
+                        SeenSide<T>& seen) {
+  const T* present = S == Slopes::none ? table.weight : table.inside;
+  const bool fixed = axis.fixed(t);
+  const T tap = fixed ? T(0) : static_cast<T>(axis.tap_doubled(t)) / 2;
+  int places = 0;
+  for (int side = 0; side < (fixed ? 1 : 2); ++side) {
+    const int64_t at = (2 * t + side) * kTile + m;
+    if (present[at] == 0) continue;
+    seen.read[places] = table.read[at];
+    if constexpr (Writes) seen.write[places] = table.write[at];
+    seen.weight[places] = table.weight[at];
+    if constexpr (S != Slopes::none) seen.slope[places] = side == 0 ? -tap : tap;
+    ++places;
+  }
+  return places;
+}
+
+// body(rows, columns, y, x, t) for each tap in the rows taps_y of the kernel: constants that say
+// how many rows and columns of corners are seen, both 0 where none is, the tap's sides and its
+// number from the first.
+template <bool Writes, Slopes S, class T, class Body>
+SURFCONV_INLINE void walk_seen(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
+                               const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
+  using Zero = std::integral_constant<int, 0>;
+  using One = std::integral_constant<int, 1>;
+  using Two = std::integral_constant<int, 2>;
+  SeenSide<T> seen_x[kMostTaps];
+  int places_x[kMostTaps];
+  for (int64_t tx = 0; tx < axis_x.kernel; ++tx) {
+    places_x[tx] = see<false, S>(axis_x, columns, tx, m, seen_x[tx]);
+  }
+  int64_t t = 0;
+  for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty) {
+    SeenSide<T> y;
+    const int places_y = see<Writes, S>(axis_y, rows, ty, m, y);
+    for (int64_t tx = 0; tx < axis_x.kernel; ++tx, ++t) {
+      const SeenSide<T>& x = seen_x[tx];
+      const int places = places_y == 0 ? 0 : places_x[tx];
+      if (places == 0) {
+        body(Zero{}, Zero{}, y, x, t);
+      } else if (places_y == 1) {
+        places == 1 ? body(One{}, One{}, y, x, t) : body(One{}, Two{}, y, x, t);
+      } else {
+        places == 1 ? body(Two{}, One{}, y, x, t) : body(Two{}, Two{}, y, x, t);
+      }
+    }
+  }
+}
+
+// body(corner, its row among the tap's, its column)
+template <int ROWS, int COLUMNS, class Body>
+SURFCONV_INLINE void for_corners(const Body& body) {
+#pragma GCC unroll 4
+  for (int q = 0; q < ROWS * COLUMNS; ++q) body(q, q / COLUMNS, q % COLUMNS);
+}
