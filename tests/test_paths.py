@@ -217,3 +217,29 @@ def test_centres_outside_the_image_see_none_of_it(groups: int) -> None:
         problem.input, problem.weight[..., 1:2, 1:2], problem.bias, padding=2, groups=groups
     )
     assert torch.equal(problem.run(surf_conv2d).isfinite(), alone.isfinite())
+
+
+@pytest.mark.parametrize("channels", [4, 16, 20])
+@pytest.mark.parametrize("seen", [1.0, 1.5])
+def test_places_of_zero_weight_count_for_the_slope_alone(channels: int, seen: float) -> None:
+    """On the grid along y, a tap's second row has no weight: what it holds and gets is nobody's."""
+    problem = make_problem(
+        1, channels, 3, (9, 11), stride=(4, 1), padding=1, axes=2, layout="channels_last"
+    )
+    problem.scale[:, 0], problem.scale[:, 1] = 1.0, seen
+    beyond = [2, 6]  # rows next to those that the taps of output rows 0, 4 and 8 lie on
+    values = {name: getattr(problem, name).clone() for name in ("input", "weight", "scale")}
+    values["input"][:, :, beyond] = torch.inf
+    leaves = {name: value.requires_grad_() for name, value in values.items()}
+    output = replace(problem, **leaves).run(surf_conv2d)
+    assert output.isfinite().all()
+    grad = torch.ones_like(output)
+    grads = dict(zip(leaves, torch.autograd.grad(output, list(leaves.values()), grad), strict=True))
+    assert grads["weight"].isfinite().all()
+    assert not grads["scale"][:, 0].isfinite().all()
+
+    values["input"].data[:, :, beyond] = 0.0
+    output = replace(problem, **leaves).run(surf_conv2d)
+    grad[...] = torch.inf
+    grads = dict(zip(leaves, torch.autograd.grad(output, list(leaves.values()), grad), strict=True))
+    assert grads["input"][:, :, beyond].eq(0).all() and not grads["input"].isfinite().all()
