@@ -1,5 +1,5 @@
-// Scattering the taps of interior pixels and of those on the grid, straight from the tables of the
-// two axes.
+// Scattering the taps of pixels that need no list of corners, straight from the tables of both
+// axes.
 
 // One tap in two rows and two columns, one vector of channels: along the rows first, so that the
 // weights of the two axes are enough.
