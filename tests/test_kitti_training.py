@@ -140,7 +140,7 @@ def test_the_cosine_ends_at_zero() -> None:
 def test_a_run_learns_and_its_checkpoint_evaluates_to_its_own_figures(
     frames: Path, capsys: pytest.CaptureFixture[str], mode: str
 ) -> None:
-    # At the paper's rate eight epochs on three frames are chaos: rounding decides where they end.
+    # At the schedule's own rate eight epochs on three frames are chaos: rounding decides the end.
     steady = ("--epochs", "8", "--rate", "0.002")
     train_script.main(arguments(frames, "run", "--mode", mode, *steady))
     run = frames.parent / "run"

@@ -68,7 +68,7 @@ def test_kernels(place: str, kernel: int | tuple[int, int]) -> None:
 def test_few_channels(
     place: str, kernel: int | tuple[int, int], channels: int, out_channels: int
 ) -> None:
-    """Up to eight of both, contracted without a gathered matrix where no more taps than fit it."""
+    """Up to eight of both, without a gathered matrix where all taps are taken at a time."""
     problem = make_problem(
         2, channels, out_channels, SIZE, kernel, padding=2, layout="channels_last"
     )

@@ -262,8 +262,8 @@ class BackwardTile {
   const std::vector<ChannelBlock> blocks_;
   const std::vector<Unit> units_;
   const int64_t taps_;
-  const bool
-      swapped_;  // partial grad_weight as [output][tap, channel]: few outputs, fuller vectors
+  // Partial grad_weight as [output][tap, channel]: vectors full at few outputs.
+  const bool swapped_;
   const OutputGradient<T> output_;
   const int64_t width_, ld_rows_;
   const bool needs_matrix_;

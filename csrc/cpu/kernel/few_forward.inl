@@ -8,7 +8,7 @@ struct Few {
   explicit operator bool() const { return lanes > 0; }
 };
 
-constexpr int kFew = 8;
+constexpr int kFew = 8;  // most channels, and most outputs
 
 template <class T>
 Few few_of(const Plan& plan, int64_t taps_at_once) {
@@ -89,38 +89,44 @@ class FewSums {
   V sums_[OUTPUTS] = {};
 };
 
+// walk(m, add) for each pixel m of the run; add(sample, t) for each tap of it that is seen.
+template <int LANES, int OUTPUTS, class T, class Walk>
+SURFCONV_INLINE void few_pixels(const FewTile<T>& few, const Run& run, const Walk& walk) {
+  for (int m = run.begin; m < run.end; ++m) {
+    FewSums<T, LANES, OUTPUTS> sums;
+    walk(m, [&](Vec<T, LANES> sample, int64_t t) SURFCONV_INLINED { sums.add(sample, few, t); });
+    sums.finish(few, m);
+  }
+}
+
 template <int KX, int LANES, int OUTPUTS, class T>
 void few_interior(FewTile<T> few, const Run& run) {
   using W = Vec<T, LANES>;
   const Axis axis_y = few.conv.y, axis_x = few.conv.x;
   const AxisTable<T> rows = few.tile.rows(), columns = few.tile.columns();
-  for (int m = run.begin; m < run.end; ++m) {
-    FewSums<T, LANES, OUTPUTS> sums;
-    walk_taps<KX, W>(
-        axis_y, axis_x, rows, columns, {0, axis_y.kernel}, m,
-        [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t) SURFCONV_INLINED {
-          sample_tap<decltype(r)::value, decltype(c)::value, T>(
-              few.base, y, x, Fixed<LANES>{},
-              [&](int64_t, W sample) SURFCONV_INLINED { sums.add(sample, few, t); });
-        });
-    sums.finish(few, m);
-  }
+  few_pixels<LANES, OUTPUTS>(few, run, [&](int m, const auto& add) SURFCONV_INLINED {
+    walk_taps<KX, W>(axis_y, axis_x, rows, columns, {0, axis_y.kernel}, m,
+                     [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t)
+                         SURFCONV_INLINED {
+                           sample_tap<decltype(r)::value, decltype(c)::value, T>(
+                               few.base, y, x, Fixed<LANES>{},
+                               [&](int64_t, W sample) SURFCONV_INLINED { add(sample, t); });
+                         });
+  });
 }
 
 template <int KX, int LANES, int OUTPUTS, class T>
 void few_grid(FewTile<T> few, const Run& run) {
   const Axis axis_y = few.conv.y, axis_x = few.conv.x;
   const AxisTable<T> rows = few.tile.rows(), columns = few.tile.columns();
-  for (int m = run.begin; m < run.end; ++m) {
-    FewSums<T, LANES, OUTPUTS> sums;
+  few_pixels<LANES, OUTPUTS>(few, run, [&](int m, const auto& add) SURFCONV_INLINED {
     walk_grid<KX>(axis_y, axis_x, rows, columns, {0, axis_y.kernel}, m,
                   [&](auto, auto, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
                       SURFCONV_INLINED {
                         const T* from = reinterpret_cast<const T*>(few.base + y.read + x.read);
-                        sums.add(load<Vec<T, LANES>>(from), few, t);
+                        add(load<Vec<T, LANES>>(from), t);
                       });
-    sums.finish(few, m);
-  }
+  });
 }
 
 // Pixels of which part may lie outside the image.
@@ -128,47 +134,33 @@ template <int LANES, int OUTPUTS, class T>
 void few_seen(FewTile<T> few, const Run& run) {
   const Axis axis_y = few.conv.y, axis_x = few.conv.x;
   const AxisTable<T> rows = few.tile.rows(), columns = few.tile.columns();
-  for (int m = run.begin; m < run.end; ++m) {
-    FewSums<T, LANES, OUTPUTS> sums;
-    walk_seen<false, Slopes::none>(axis_y, axis_x, rows, columns, {0, axis_y.kernel}, m,
-                                   [&](auto r, auto c, const SeenSide<T>& y, const SeenSide<T>& x,
-                                       int64_t t) SURFCONV_INLINED {
-                                     if constexpr (decltype(r)::value > 0) {
-                                       blend_seen<decltype(r)::value, decltype(c)::value>(
-                                           few.base, y, x, Fixed<LANES>{},
-                                           [&](int64_t, Vec<T, LANES> sample)
-                                               SURFCONV_INLINED { sums.add(sample, few, t); });
-                                     }
-                                   });
-    sums.finish(few, m);
-  }
+  const auto walk = [&](int m, const auto& add) SURFCONV_INLINED {
+    const auto tap = [&](auto r, auto c, const SeenSide<T>& y, const SeenSide<T>& x,
+                         int64_t t) SURFCONV_INLINED {
+      if constexpr (decltype(r)::value > 0) {
+        blend_seen<decltype(r)::value, decltype(c)::value>(
+            few.base, y, x, Fixed<LANES>{},
+            [&](int64_t, Vec<T, LANES> sample) SURFCONV_INLINED { add(sample, t); });
+      }
+    };
+    walk_seen<false, Slopes::none>(axis_y, axis_x, rows, columns, {0, axis_y.kernel}, m, tap);
+  };
+  few_pixels<LANES, OUTPUTS>(few, run, walk);
 }
 
 // Pixels whose corners are listed.
 template <int LANES, int OUTPUTS, class T>
 void few_listed(FewTile<T> few, const Run& run) {
   const int64_t taps = few.conv.y.kernel * few.conv.x.kernel;
-  for (int m = run.begin; m < run.end; ++m) {
-    FewSums<T, LANES, OUTPUTS> sums;
+  few_pixels<LANES, OUTPUTS>(few, run, [&](int m, const auto& add) SURFCONV_INLINED {
     for (int64_t t = 0; t < taps; ++t) {
-      const auto add = [&](auto corners) SURFCONV_INLINED {
+      with_corners(few.tile.tap(t).corners, [&](auto corners) SURFCONV_INLINED {
         blend_listed<decltype(corners)::value>(few.tile.tap(t), few.base, m, Fixed<LANES>{},
                                                [&](int64_t, Vec<T, LANES> sample)
-                                                   SURFCONV_INLINED { sums.add(sample, few, t); });
-      };
-      switch (few.tile.tap(t).corners) {
-        case 1:
-          add(std::integral_constant<int, 1>{});
-          break;
-        case 2:
-          add(std::integral_constant<int, 2>{});
-          break;
-        default:
-          add(std::integral_constant<int, 4>{});
-      }
+                                                   SURFCONV_INLINED { add(sample, t); });
+      });
     }
-    sums.finish(few, m);
-  }
+  });
 }
 
 template <int LANES, int OUTPUTS, class T>

@@ -36,13 +36,8 @@ SURFCONV_INLINE void blend_seen(const char* base, const SeenSide<T>& y, const Se
     for_channels<T>(channels, [&](int64_t c, auto width)
                                   SURFCONV_INLINED { sink(c, Vec<T, decltype(width)::lanes>{}); });
   } else {
-    const T* from[ROWS * COLUMNS];
-    T weight[ROWS * COLUMNS];
-    for_corners<ROWS, COLUMNS>([&](int q, int i, int j) SURFCONV_INLINED {
-      from[q] = reinterpret_cast<const T*>(base + y.read[i] + x.read[j]);
-      weight[q] = y.weight[i] * x.weight[j];
-    });
-    blend<ROWS * COLUMNS>(from, weight, channels, sink);
+    const auto corners = corners_of<ROWS, COLUMNS, T>(base, y, x);
+    blend<ROWS * COLUMNS>(corners.from, corners.weight, channels, sink);
   }
 }
 
@@ -75,14 +70,9 @@ template <class T>
 void gather_tap(const TapCorners<T>& tap, const char* base, int begin, int end, int64_t channels,
                 T* to, int64_t ld) {
   with_channels<T>(channels, [&](auto known) {
-    switch (tap.corners) {
-      case 1:
-        return gather_corners<T, 1>(tap, base, begin, end, known, to, ld);
-      case 2:
-        return gather_corners<T, 2>(tap, base, begin, end, known, to, ld);
-      default:
-        return gather_corners<T, 4>(tap, base, begin, end, known, to, ld);
-    }
+    with_corners(tap.corners, [&](auto corners) {
+      gather_corners<T, decltype(corners)::value>(tap, base, begin, end, known, to, ld);
+    });
   });
 }
 

@@ -26,24 +26,13 @@ struct SeenAxis {
     sides = memory.take<int8_t>(taps * kTile);
   }
 
-  void fill(const Axis& axis, const AxisTable<T>& table, const Run& run) const {
+  void fill(Axis axis, AxisTable<T> table, const Run& run) const {
     for (int64_t t = 0; t < taps; ++t) {
-      const T* weight = table.weight + t * 2 * kTile;
-      const int64_t* read = table.read + t * 2 * kTile;
-      SeenTap<T>* to = seen + t * kTile;
-      int8_t* count = sides + t * kTile;
-      if (axis.fixed(t)) {
-        for (int m = run.begin; m < run.end; ++m) {
-          to[m] = {read[m], {weight[m], T(0)}};
-          count[m] = weight[m] != 0 ? 1 : 0;
-        }
-        continue;
-      }
       for (int m = run.begin; m < run.end; ++m) {
-        const T first = weight[m], second = weight[kTile + m];
-        const bool lower = first != 0, upper = second != 0;
-        to[m] = {lower ? read[m] : read[kTile + m], {lower ? first : second, second}};
-        count[m] = static_cast<int8_t>(lower + upper);
+        SeenSide<T> side;
+        const int places = see<false, Slopes::none>(axis, table, t, m, side);
+        seen[t * kTile + m] = {side.read[0], {side.weight[0], side.weight[1]}};
+        sides[t * kTile + m] = static_cast<int8_t>(places);
       }
     }
   }

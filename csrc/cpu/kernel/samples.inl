@@ -191,6 +191,19 @@ struct TapCorners {
   T* slope_x;  // of scale_x
 };
 
+// body(corners as a constant)
+template <class Body>
+SURFCONV_INLINE void with_corners(int corners, const Body& body) {
+  switch (corners) {
+    case 1:
+      return body(std::integral_constant<int, 1>{});
+    case 2:
+      return body(std::integral_constant<int, 2>{});
+    default:
+      return body(std::integral_constant<int, 4>{});
+  }
+}
+
 template <class T>
 struct CornerTable {
   T* weight;

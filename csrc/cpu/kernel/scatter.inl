@@ -122,12 +122,5 @@ void scatter_tap(const TapCorners<T>& tap, const ScatterTarget<T>& target, int b
     }
     with_channels<T>(channels, [&](auto known) { run(corners, std::false_type{}, known); });
   };
-  switch (tap.corners) {
-    case 1:
-      return by_kink(std::integral_constant<int, 1>{});
-    case 2:
-      return by_kink(std::integral_constant<int, 2>{});
-    default:
-      return by_kink(std::integral_constant<int, 4>{});
-  }
+  with_corners(tap.corners, by_kink);
 }

@@ -1,6 +1,6 @@
-// The taps of a pixel of which part may lie outside the image: only places inside are walked.
+// The taps of a pixel of which part may lie outside the image: places outside are left out.
 
-// The places of a tap along one axis, none to two of them. Bytes.
+// The places of a tap along one axis, none to two of them, the seen ones first. Bytes.
 template <class T>
 struct SeenSide {
   int64_t read[2];
@@ -13,20 +13,19 @@ struct SeenSide {
 template <bool Writes, Slopes S, class T>
 SURFCONV_INLINE int see(const Axis& axis, const AxisTable<T>& table, int64_t t, int m,
                         SeenSide<T>& seen) {
-  const T* present = S == Slopes::none ? table.weight : table.inside;
   const bool fixed = axis.fixed(t);
-  const T tap = fixed ? T(0) : static_cast<T>(axis.tap_doubled(t)) / 2;
-  int places = 0;
-  for (int side = 0; side < (fixed ? 1 : 2); ++side) {
-    const int64_t at = (2 * t + side) * kTile + m;
-    if (present[at] == 0) continue;
-    seen.read[places] = table.read[at];
-    if constexpr (Writes) seen.write[places] = table.write[at];
-    seen.weight[places] = table.weight[at];
-    if constexpr (S != Slopes::none) seen.slope[places] = side == 0 ? -tap : tap;
-    ++places;
+  const int64_t lower = 2 * t * kTile + m, upper = fixed ? lower : lower + kTile;
+  const T* present = S == Slopes::none ? table.weight : table.inside;
+  const bool has_lower = present[lower] != 0, has_upper = !fixed && present[upper] != 0;
+  const int64_t first = has_lower ? lower : upper;
+  seen.read[0] = table.read[first], seen.read[1] = table.read[upper];
+  seen.weight[0] = table.weight[first], seen.weight[1] = table.weight[upper];
+  if constexpr (Writes) seen.write[0] = table.write[first], seen.write[1] = table.write[upper];
+  if constexpr (S != Slopes::none) {
+    const T tap = fixed ? T(0) : static_cast<T>(axis.tap_doubled(t)) / 2;
+    seen.slope[0] = has_lower ? -tap : tap, seen.slope[1] = tap;
   }
-  return places;
+  return has_lower + has_upper;
 }
 
 // body(rows, columns, y, x, t) for each tap in the rows taps_y of the kernel: constants that say
@@ -59,11 +58,4 @@ SURFCONV_INLINE void walk_seen(const Axis& axis_y, const Axis& axis_x, const Axi
       }
     }
   }
-}
-
-// body(corner, its row among the tap's, its column)
-template <int ROWS, int COLUMNS, class Body>
-SURFCONV_INLINE void for_corners(const Body& body) {
-#pragma GCC unroll 4
-  for (int q = 0; q < ROWS * COLUMNS; ++q) body(q, q / COLUMNS, q % COLUMNS);
 }

@@ -16,7 +16,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "seen.inl"
 #include "gather.inl"
 #include "scatter.inl"
-#include "scatter_interior.inl"
+#include "scatter_walk.inl"
 #include "pointwise_pixels.inl"
 #include "pointwise.inl"
 #include "bands.inl"

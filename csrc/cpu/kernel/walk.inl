@@ -1,4 +1,4 @@
-// The taps of one interior pixel, straight from the tables of the two axes.
+// The taps of one pixel inside the image or on its grid, straight from the tables of the two axes.
 
 // The type of a pixel's weights: where samples are one vector of channels, that vector, so that a
 // weight is spread over its lanes once and not for every tap that it serves.
@@ -130,9 +130,10 @@ struct Corners {
   const T* from[count];
   W weight[count];
 };
-template <int ROWS, int COLUMNS, class T, class W>
-SURFCONV_INLINE Corners<ROWS, COLUMNS, T, W> corners_of(const char* base, const TapSide<W>& y,
-                                                        const TapSide<W>& x) {
+// Side: where along an axis, and what it weighs there, see TapSide and SeenSide.
+template <int ROWS, int COLUMNS, class T, template <class> class Side, class W>
+SURFCONV_INLINE Corners<ROWS, COLUMNS, T, W> corners_of(const char* base, const Side<W>& y,
+                                                        const Side<W>& x) {
   Corners<ROWS, COLUMNS, T, W> corners;
 #pragma GCC unroll 4
   for (int q = 0; q < ROWS * COLUMNS; ++q) {

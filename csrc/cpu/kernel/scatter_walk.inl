@@ -122,6 +122,38 @@ void scatter_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Row
   }
 }
 
+template <int ROWS, int COLUMNS, bool Writes, Slopes S, class T, class Channels, class Dot>
+SURFCONV_INLINE void scatter_seen_place(const ScatterTarget<T>& target, const SeenSide<T>& y,
+                                        const SeenSide<T>& x, Channels channels, T* row, Dot& dot) {
+  constexpr int CORNERS = ROWS * COLUMNS;
+  if constexpr (CORNERS == 0) {
+    for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
+      store(row + c, Vec<T, decltype(width)::lanes>{});
+    });
+  } else {
+    const auto corners = corners_of<ROWS, COLUMNS, T>(target.read, y, x);
+    T* to[CORNERS] = {};
+    T slope[CORNERS], slope_x[CORNERS];
+#pragma GCC unroll 4
+    for (int q = 0; q < CORNERS; ++q) {
+      const int i = q / COLUMNS, j = q % COLUMNS;
+      if constexpr (Writes) {
+        // A corner of zero weight is here for the slope alone.
+        to[q] = corners.weight[q] == 0
+                    ? target.discard
+                    : reinterpret_cast<T*>(target.write + y.write[i] + x.read[j]);
+      }
+      if constexpr (S != Slopes::none) {
+        const T along_y = y.slope[i] * x.weight[j], along_x = x.slope[j] * y.weight[i];
+        slope[q] = S == Slopes::one ? along_y + along_x : along_y;
+        slope_x[q] = along_x;
+      }
+    }
+    scatter_corners<CORNERS, Writes, S, S != Slopes::none>(corners.from, to, corners.weight, slope,
+                                                           slope_x, channels, row, dot);
+  }
+}
+
 // Whole rows of taps of the pixels begin .. end-1, of which part may lie outside the image.
 template <bool Writes, Slopes S, class T, class Channels>
 void scatter_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
@@ -131,33 +163,12 @@ void scatter_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Row
   for (int m = begin; m < end; ++m) {
     PixelDot<T, Channels> dot(target, m);
     T* row = matrix + m * ld;
-    walk_seen<Writes, S>(
-        axis_y, axis_x, rows, columns, taps_y, m,
-        [&](auto r, auto c, const SeenSide<T>& y, const SeenSide<T>& x, int64_t t)
-            SURFCONV_INLINED {
-              constexpr int ROWS = decltype(r)::value, COLUMNS = decltype(c)::value;
-              constexpr int CORNERS = ROWS * COLUMNS, PLACES = CORNERS + 1;
-              const T* from[PLACES];
-              T* to[PLACES] = {};
-              T weight[PLACES], slope[PLACES], slope_x[PLACES];
-              for_corners<ROWS, COLUMNS>([&](int q, int i, int j) SURFCONV_INLINED {
-                from[q] = reinterpret_cast<const T*>(target.read + y.read[i] + x.read[j]);
-                weight[q] = y.weight[i] * x.weight[j];
-                // A corner of zero weight is here for the slope alone.
-                if constexpr (Writes) {
-                  to[q] = weight[q] == 0
-                              ? target.discard
-                              : reinterpret_cast<T*>(target.write + y.write[i] + x.read[j]);
-                }
-                if constexpr (S != Slopes::none) {
-                  const T along_y = y.slope[i] * x.weight[j], along_x = x.slope[j] * y.weight[i];
-                  slope[q] = S == Slopes::one ? along_y + along_x : along_y;
-                  slope_x[q] = along_x;
-                }
-              });
-              scatter_corners<CORNERS, Writes, S, S != Slopes::none>(
-                  from, to, weight, slope, slope_x, channels, row + t * count_of(channels), dot);
-            });
+    walk_seen<Writes, S>(axis_y, axis_x, rows, columns, taps_y, m,
+                         [&](auto r, auto c, const SeenSide<T>& y, const SeenSide<T>& x,
+                             int64_t t) SURFCONV_INLINED {
+                           scatter_seen_place<decltype(r)::value, decltype(c)::value, Writes, S>(
+                               target, y, x, channels, row + t * count_of(channels), dot);
+                         });
     if constexpr (S != Slopes::none) dot.finish();
     if constexpr (S == Slopes::two) dot.finish_x();
   }
