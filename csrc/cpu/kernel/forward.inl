@@ -22,7 +22,6 @@ class Forward {
                              : !plan_.lanewise && plan_.outputs == width_) &&
                      tensors.output.dtype == kComputeDType<T> && tensors.output.c == 1 &&
                      tensors.output.y == tensors.output.x * conv.x.out),
-        prefetches_(plan_.row * static_cast<int64_t>(sizeof(T)) <= 64 && conv.y.kernel > 1),
         unseen_(static_cast<size_t>(plan_.row + kLanes<T>), T(0)) {
     pack_weights();
   }
@@ -130,7 +129,12 @@ class Forward {
                           begin * tensors_.output.x
                     : scratch.out;
     const int64_t group_step = direct ? plan_.outputs : width_;
+    const auto fetch_ahead = [&](int64_t channel, int64_t channels) SURFCONV_INLINED {
+      prefetch_ahead(conv_, scratch.tile, count,
+                     {base + channel * bytes, steps_y.read, steps_x.read, channels * bytes});
+    };
     if (fused_) {
+      fetch_ahead(0, plan_.row);
       lane_forward(conv_, plan_, scratch.tile, scratch.lanes, base, steps_y.read, steps_x.read,
                    weights_.get(), initial_.data(), out, ld_out);
     }
@@ -161,9 +165,7 @@ class Forward {
         const int64_t step = plan_.lanewise ? block.padded : block.count;
         gather_tile(conv_, scratch.tile, first_tap, taps, base + channel * bytes, block.padded,
                     scratch.rows, ld_rows_, step, fused_);
-        if (prefetches_ && first_tap + taps == plan_.taps) {
-          prefetch_ahead(scratch.tile, base, count);
-        }
+        if (first_tap + taps == plan_.taps) fetch_ahead(channel, block.padded);
         if (plan_.lanewise) {
           multiply_lanes(scratch, block, first_tap, taps, count, out, ld_out);
         } else {
@@ -209,20 +211,6 @@ class Forward {
     });
   }
 
-  // The rows that the lowest taps of the tiles to come will meet first, while the product is busy:
-  // the processor's own prefetching stops at the gaps between tiles. Neighbours are at like depths.
-  void prefetch_ahead(const Tile<T>& tile, const char* base, int count) const {
-    constexpr int64_t kTilesAhead = 3;
-    const int64_t ahead = kTilesAhead * kTile * conv_.x.stride * input_.step_x();
-    const int64_t* rows = tile.rows().read + (conv_.y.kernel * 2 - 1) * kTile;
-    const int64_t* columns = tile.columns().read + conv_.x.kernel / 2 * 2 * kTile;
-    const int of_line = static_cast<int>(64 / (plan_.row * static_cast<int64_t>(sizeof(T))));
-    for (int m = 0; m < count; m += of_line) {
-      __builtin_prefetch(base + rows[m] + columns[m] + ahead * static_cast<int64_t>(sizeof(T)), 0,
-                         2);
-    }
-  }
-
   const Conv& conv_;
   const ForwardTensors& tensors_;
   const Executor& executor_;
@@ -234,7 +222,7 @@ class Forward {
   InputRows<T> input_;
   GuideRows<T> guide_;
   const bool fused_;  // lanewise without a gathered matrix, but where a guide hides corners
-  const bool writes_rows_, prefetches_;
+  const bool writes_rows_;
   std::vector<T> unseen_;  // what a corner outside the image reads
   std::vector<T> initial_;
   Buffer<T> weights_;

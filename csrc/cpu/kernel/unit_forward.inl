@@ -7,6 +7,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "guide.inl"
 #include "samples.inl"
 #include "tile.inl"
+#include "prefetch.inl"
 #include "gemm.inl"
 #include "lanewise.inl"
 #include "blocks.inl"
