@@ -1,7 +1,7 @@
 """Backward where a few pixels reach far: spurious depths close to the camera, as sensors have them.
 
 The images are large enough that their rows are shared out among tasks; such pixels reach beyond
-what their task has room for.
+the rows that their task may write, and other pixels as far as their task may reach.
 """
 
 from __future__ import annotations
@@ -108,3 +108,26 @@ def test_far_pixels_change_nothing_else() -> None:
         problem.scale[:, :, y, x] = 1.0
     expected = problem.solve(surf_conv2d, torch.float64)[0]
     torch.testing.assert_close(got, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("kernel", [2, 3, 7])
+@pytest.mark.parametrize("stride", [1, 2])
+def test_tasks_at_one_time_write_different_rows(kernel: int, stride: int) -> None:
+    """Two tasks that wrote the same row would add to it in another order on more threads."""
+    generator = torch.Generator().manual_seed(6)
+    x = torch.randn(1, 4, 96 * stride, 100 * stride, generator=generator).requires_grad_()
+    weight = torch.randn(4, 4, kernel, kernel, generator=generator)
+    sizes = [(n + kernel // 2 * 2 - kernel) // stride + 1 for n in x.shape[2:]]
+    # Of the outermost taps, in pixels: on one, just before it and just after.
+    for reach in range(stride, 9 * stride, stride):
+        for nudge in (-1e-6, 0.0, 1e-6, 0.5):
+            scale = torch.full((1, *sizes), (reach + nudge) * 2 / (kernel - 1))
+            out = surf_conv2d(x, weight, scale=scale, stride=stride, padding=kernel // 2)
+            grad = torch.randn(out.shape, generator=generator)
+            torch.set_num_threads(1)
+            (alone,) = torch.autograd.grad(out, x, grad, retain_graph=True)
+            for threads in (2, 5):
+                torch.set_num_threads(threads)
+                (got,) = torch.autograd.grad(out, x, grad, retain_graph=True)
+                assert_same_bits(got, alone, f"{reach + nudge} pixels, {threads} threads")

@@ -19,7 +19,7 @@ class Backward {
   }
 
   void run() {
-    // In passes even where nothing is copied: spill rows and partial sums are bounded with them.
+    // In passes even where nothing is copied: partial sums of the scale are bounded with them.
     const std::vector<Pass> passes =
         make_passes<T>(conv_, tensors_.scale, true, input_.row_elements());
     input_.reserve(passes);
@@ -30,15 +30,14 @@ class Backward {
       grad_scale_ = Buffer<T>(units() * most);
     }
     std::vector<std::vector<Slot>> slots;  // of each pass
-    size_t most_slots = 1;
+    int64_t partials = 1;
     for (const Pass& pass : passes) {
       slots.push_back(
           make_slots<T>(conv_, tensors_.scale, pass, slots_wanted_, grad_input_.needed()));
-      most_slots = std::max(most_slots, slots.back().size());
+      if (!slots.back().empty()) partials = std::max(partials, slots.back().back().partial + 1);
     }
-    if (grad_input_.needed()) spill_ = Buffer<T>(most_spilled(slots) * input_.row_elements());
-    partials_ = Buffer<T>(static_cast<int64_t>(most_slots) * partial_elements());
-    clear_partials(static_cast<int64_t>(most_slots));
+    partials_ = Buffer<T>(partials * partial_elements());
+    clear_partials(partials);
     for (size_t i = 0; i < passes.size(); ++i) {
       const Pass& pass = passes[i];
       const auto same_image = [&](size_t other) {
@@ -50,14 +49,12 @@ class Backward {
       input_.pack(pass, executor_);
       guide_.pack(pass.first_image, pass.images, executor_);
       grad_input_.begin(pass, previous, executor_);
-      lay_out_spill(pass, slots[i]);
       run_slots(pass, slots[i]);
-      add_spill(pass, slots[i]);
       add_far(pass, slots[i]);
       grad_input_.end(pass, previous == nullptr, same_image(i + 1), executor_);
       if (tensors_.grad_scale.data != nullptr) store_scale(pass);
     }
-    store_weights(static_cast<int64_t>(most_slots));
+    store_weights(partials);
   }
 
  private:
@@ -69,87 +66,38 @@ class Backward {
   }
   int64_t partial_elements() const { return weight_elements_ + tile_.bias_elements(); }
 
-  void clear_partials(int64_t slots) {
+  void clear_partials(int64_t partials) {
     const int64_t elements = partial_elements();
-    run_tasks(
-        executor_, slots, workers_for(executor_, slots, slots * elements / 4),
-        [&](int, int64_t slot) { std::fill_n(partials_.get() + slot * elements, elements, T(0)); });
-  }
-
-  // Rows of spill that any pass needs: one buffer serves them all.
-  static int64_t most_spilled(const std::vector<std::vector<Slot>>& passes) {
-    int64_t most = 0;
-    for (const std::vector<Slot>& slots : passes) {
-      int64_t spilled = 0;
-      for (const Slot& slot : slots) spilled += slot.spilled();
-      most = std::max(most, spilled);
-    }
-    return most;
-  }
-
-  // Gives each slot the place of every input row that it scatters to.
-  void lay_out_spill(const Pass& pass, std::vector<Slot>& slots) {
-    if (!grad_input_.needed()) return;
-    int64_t spilled = 0;
-    for (const Slot& slot : slots) spilled += slot.spilled();
-    const int64_t elements = grad_input_.row_elements();
-    std::fill_n(spill_.get(), spilled * elements, T(0));
-    T* next = spill_.get();
-    for (Slot& slot : slots) {
-      const int64_t n = pass.first_image + slot.first_image;
-      const T* image = grad_input_.row(pass, n, pass.in.begin);
-      const int64_t step = elements * static_cast<int64_t>(sizeof(T));
-      const int64_t before = slot.own.begin - slot.reach.begin;
-      const int64_t spill = byte_distance(image, next);
-      RowPlaces& places = slot.places;
-      places.begin = slot.own.begin, places.end = slot.own.end;
-      places.reach_begin = slot.reach.begin, places.reach_end = slot.reach.end;
-      places.step = step;
-      places.before = spill - slot.reach.begin * step;
-      places.own = -pass.in.begin * step;
-      places.after = spill + (before - slot.own.end) * step;
-      places.limited = slot.far;
-      next += slot.spilled() * elements;
-    }
-  }
-
-  void add_spill(const Pass& pass, const std::vector<Slot>& slots) {
-    if (!grad_input_.needed()) return;
-    const int64_t elements = grad_input_.row_elements(), rows = pass.in.count();
-    run_tasks(executor_, rows, workers_for(executor_, rows, rows * elements), [&](int, int64_t i) {
-      const int64_t y = pass.in.begin + i;
-      for (const Slot& slot : slots) {
-        if (slot.own.has(y) || !slot.reach.has(y)) continue;
-        const int64_t n = pass.first_image + slot.first_image;
-        const T* image = grad_input_.row(pass, n, pass.in.begin);
-        const T* from = reinterpret_cast<const T*>(reinterpret_cast<uintptr_t>(image) +
-                                                   static_cast<uintptr_t>(slot.places(y)));
-        T* to = grad_input_.row(pass, n, y);
-        for (int64_t e = 0; e < elements; ++e) to[e] += from[e];
-      }
-    });
+    run_tasks(executor_, partials, workers_for(executor_, partials, partials * elements / 4),
+              [&](int, int64_t i) { std::fill_n(partials_.get() + i * elements, elements, T(0)); });
   }
 
   void run_slots(const Pass& pass, const std::vector<Slot>& slots) {
     const Plan& plan = tile_.plan();
-    const int64_t tasks = static_cast<int64_t>(slots.size()) * units();
     const int64_t pixels = pass.images * pass.out.count() * conv_.x.out;
-    const int workers =
-        workers_for(executor_, tasks, pixels * plan.taps * plan.channels * conv_.out_channels);
+    const int workers = workers_for(executor_, static_cast<int64_t>(slots.size()) * units(),
+                                    pixels * plan.taps * plan.channels * conv_.out_channels);
     Workspace memory(workers * tile_.need());
     std::vector<typename BackwardTile<T>::Scratch> scratch;
     scratch.reserve(static_cast<size_t>(workers));
     for (int i = 0; i < workers; ++i) scratch.push_back(tile_.take(memory));
-    run_tasks(executor_, tasks, workers, [&](int worker, int64_t task) {
-      const int64_t unit = task % units(), index = task / units();
-      run_slot(scratch[static_cast<size_t>(worker)], pass, slots[static_cast<size_t>(index)], unit,
-               partials_.get() + index * partial_elements());
-    });
+    for (int phase = 0; phase < kPhases; ++phase) {
+      std::vector<const Slot*> chosen;
+      for (const Slot& slot : slots) {
+        if (slot.phase == phase) chosen.push_back(&slot);
+      }
+      const int64_t tasks = static_cast<int64_t>(chosen.size()) * units();
+      run_tasks(executor_, tasks, workers, [&](int worker, int64_t task) {
+        const Slot& slot = *chosen[static_cast<size_t>(task / units())];
+        run_slot(scratch[static_cast<size_t>(worker)], pass, slot, task % units());
+      });
+    }
   }
 
   void run_slot(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
-                int64_t unit, T* partial) {
+                int64_t unit) {
     typename BackwardTile<T>::Target target{};
+    T* const partial = partials_.get() + slot.partial * partial_elements();
     if (tensors_.grad_weight.data != nullptr) {
       target.weight = partial + weight_offset_[static_cast<size_t>(unit)];
     }
@@ -160,27 +108,33 @@ class Backward {
       if (grad_scale_) {
         target.scale = grad_scale_.get() + (unit * pass.images + i) * scale_elements(pass);
       }
-      run_tiles(scratch, pass, slot, i, unit, target, slot.places);
+      run_tiles(scratch, pass, slot, i, unit, target, slot.far, false);
     }
   }
 
   // All tiles of an image of the pass; or only those that reach further than their slot.
   void run_tiles(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
-                 int64_t image, int64_t unit, typename BackwardTile<T>::Target target,
-                 RowPlaces places) {
+                 int64_t image, int64_t unit, typename BackwardTile<T>::Target target, bool limited,
+                 bool only_further) {
     constexpr int64_t bytes = sizeof(T);
     const int64_t n = pass.first_image + image, end = slot.out.end * conv_.x.out;
     target.input = input_.image(pass, n);
+    RowPlaces places;
     if (grad_input_.needed()) {
-      target.grad_input = reinterpret_cast<char*>(grad_input_.row(pass, n, pass.in.begin));
-      places.nowhere = byte_distance(target.grad_input, scratch.discard);
+      target.grad_input = grad_input_.image(pass, n);
+      places = {slot.reach.begin,
+                slot.reach.end,
+                grad_input_.row_elements() * bytes,
+                byte_distance(target.grad_input, scratch.discard),
+                only_further,
+                limited};
     }
     const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in,
                             grad_input_.needed() ? &places : nullptr};
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
     for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += kTile) {
       const int64_t count = std::min<int64_t>(kTile, end - begin);
-      if (places.only_further && !is_far(slot, n, begin, count)) continue;
+      if (only_further && !is_far(slot, n, begin, count)) continue;
       tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(n), n,
                 begin, static_cast<int>(count), steps_y, steps_x);
     }
@@ -205,10 +159,8 @@ class Backward {
     run_tasks(executor_, units(), workers, [&](int worker, int64_t unit) {
       for (const Slot& slot : slots) {
         if (!slot.far) continue;
-        RowPlaces places = slot.places;
-        places.only_further = true;
         run_tiles(scratch[static_cast<size_t>(worker)], pass, slot, slot.first_image, unit, {},
-                  places);
+                  true, true);
       }
     });
   }
@@ -228,16 +180,16 @@ class Backward {
     }
   }
 
-  void store_weights(int64_t slots) {
+  void store_weights(int64_t count) {
     T* const partials = partials_.get();
     const int64_t elements = partial_elements();
     constexpr int64_t kSpan = 4096;
     const int64_t tasks = (elements + kSpan - 1) / kSpan;
-    run_tasks(executor_, tasks, workers_for(executor_, tasks, slots * elements / 4),
+    run_tasks(executor_, tasks, workers_for(executor_, tasks, count * elements / 4),
               [&](int, int64_t task) {
                 const int64_t begin = task * kSpan, end = std::min(elements, begin + kSpan);
-                for (int64_t slot = 1; slot < slots; ++slot) {
-                  const T* from = partials + slot * elements;
+                for (int64_t k = 1; k < count; ++k) {
+                  const T* from = partials + k * elements;
                   for (int64_t i = begin; i < end; ++i) partials[i] += from[i];
                 }
               });
@@ -276,8 +228,8 @@ class Backward {
   InputRows<T> input_;
   GuideRows<T> guide_;
   GradientRows<T> grad_input_;
-  Buffer<T> grad_scale_, spill_;
-  Buffer<T> partials_;  // [slot][weights, then bias]
+  Buffer<T> grad_scale_;
+  Buffer<T> partials_;  // [partial][weights, then bias]
   std::vector<int64_t> weight_offset_;
   int64_t weight_elements_ = 0;
 };

@@ -1,17 +1,16 @@
 // How a pass of the backward is cut into slots: runs of whole images, or bands of output rows. The
-// bands of an image scatter into the same gradient: each writes the input rows it owns in place and
-// the others, into which its taps reach, to spill rows of its own, added in band order afterwards.
-// A few tiles may reach further than their band has spill rows for: they are done again, for that
-// alone, when all bands are done.
+// bands of an image scatter into the same gradient: first every other one, whose taps do not meet,
+// then those between them. A few tiles may reach further than their band may: they are done again,
+// for that alone, when all bands are done.
 struct Slot {
   int64_t first_image, images;  // within the pass
+  int phase;                    // slots of a phase scatter to different rows
+  int64_t partial;              // of weights and bias: slots of different phases share it
   Rows out;
-  Rows own, reach;   // input rows; reach holds own
-  bool far;          // some tiles reach beyond it
-  RowPlaces places;  // of the rows of reach in the gradient
-
-  int64_t spilled() const { return reach.count() - own.count(); }
+  Rows reach;  // input rows
+  bool far;    // some tiles reach beyond it
 };
+constexpr int kPhases = 2;
 
 // The spread of taps in each stretch of up to kTile pixels of the rows of a pass.
 template <class T>
@@ -48,8 +47,7 @@ class Spreads {
       slot.far |= spread > limit;
       if (spread <= limit) most = std::max(most, spread);
     }
-    const Rows around = rows_around(conv_, slot.out, most);
-    slot.reach = {std::min(slot.own.begin, around.begin), std::max(slot.own.end, around.end)};
+    slot.reach = rows_around(conv_, slot.out, most);
   }
 
  private:
@@ -59,8 +57,7 @@ class Spreads {
   std::vector<int64_t> spreads_;
 };
 
-// More than one band an image only where there are too few images for `wanted` tasks, and only
-// while the spill rows are at most half as many as the pass has.
+// More than one band an image only where there are too few images for `wanted` partials.
 template <class T>
 std::vector<Slot> make_slots(const Conv& conv, const View& scale, const Pass& pass, int64_t wanted,
                              bool scatters) {
@@ -69,38 +66,32 @@ std::vector<Slot> make_slots(const Conv& conv, const View& scale, const Pass& pa
   if (pass.images >= wanted) {
     for (int64_t i = 0; i < wanted; ++i) {
       const int64_t begin = pass.images * i / wanted, end = pass.images * (i + 1) / wanted;
-      slots.push_back({begin, end - begin, pass.out, pass.in, pass.in, false, {}});
+      slots.push_back({begin, end - begin, 0, i, pass.out, pass.in, false});
     }
     return slots;
   }
   const int64_t rows = pass.out.count(), pixels = rows * conv.x.out;
   const int64_t most =
       std::min({(wanted + pass.images - 1) / pass.images, pixels / kLeastPixels + 1, rows});
-  int64_t bands = 1;  // a power of two, which two, four or eight threads share evenly
-  while (bands * 2 <= most) bands *= 2;
+  int64_t shares = 1;  // a power of two, which two, four or eight threads share evenly
+  while (shares * 2 <= most) shares *= 2;
+  int64_t limit = 0;
   std::optional<Spreads<T>> spreads;
-  if (bands > 1 && scatters) spreads.emplace(conv, scale, pass);
-  for (;; bands /= 2) {
-    slots.clear();
-    const bool spills = bands > 1 && scatters;
-    const int64_t limit = pass.in.count() / (4 * bands);
-    if (spills && !spreads->few_beyond(limit)) continue;
-    int64_t spill = 0;
-    for (int64_t i = 0; i < pass.images; ++i) {
-      for (int64_t band = 0; band < bands; ++band) {
-        const auto share = [&](Rows all, int64_t k) { return all.begin + all.count() * k / bands; };
-        Slot slot{i,
-                  1,
-                  {share(pass.out, band), share(pass.out, band + 1)},
-                  {share(pass.in, band), share(pass.in, band + 1)},
-                  pass.in,
-                  false,
-                  {}};
-        if (spills) spreads->reach(limit, slot);
-        spill += slot.spilled();
-        slots.push_back(std::move(slot));
-      }
+  if (shares > 1 && scatters) {
+    spreads.emplace(conv, scale, pass);
+    for (; shares > 1; shares /= 2) {
+      limit = spread_apart(conv, rows / (shares * kPhases));
+      if (spreads->few_beyond(limit)) break;
     }
-    if (!spills || 2 * spill <= pass.images * pass.in.count()) return slots;
   }
+  const int phases = shares > 1 && scatters ? kPhases : 1;
+  const int64_t bands = shares * phases;
+  for (int64_t band = 0; band < pass.images * bands; ++band) {
+    const int64_t k = band % bands;
+    const Rows out{pass.out.begin + rows * k / bands, pass.out.begin + rows * (k + 1) / bands};
+    slots.push_back(
+        {band / bands, 1, static_cast<int>(k % phases), band / phases, out, pass.in, false});
+    if (phases > 1) spreads->reach(limit, slots.back());
+  }
+  return slots;
 }

@@ -19,6 +19,13 @@ class GradientRows {
     if (copies()) memory_ = Buffer<T>(most_rows(passes) * row_elements());
   }
 
+  // Where row 0 of image n would lie; only rows of the pass are there.
+  char* image(const Pass& pass, int64_t n) const {
+    const int64_t before = pass.in.begin * row_elements() * static_cast<int64_t>(sizeof(T));
+    return reinterpret_cast<char*>(reinterpret_cast<uintptr_t>(row(pass, n, pass.in.begin)) -
+                                   static_cast<uintptr_t>(before));
+  }
+
   // Row y of image n, a row of the pass.
   T* row(const Pass& pass, int64_t n, int64_t y) const {
     if (in_place_) {

@@ -38,19 +38,27 @@ T largest_scale(const Conv& conv, const View& scale, int64_t n, int64_t first, i
   return most;
 }
 
-// How many rows from its centre a tap lies at most, in whole rows with some to spare.
+// Between a sample and its centre, in whole rows rounded up; one more where it is an exact number
+// of rows, which count to the next cell. Products rounded in T may become exact.
 template <class T>
 int64_t spread_of(const Conv& conv, T scale) {
   const double tap = static_cast<double>(std::abs(conv.y.tap_doubled(0))) / 2;
-  return static_cast<int64_t>(
-      std::min(static_cast<double>(scale) * tap + 2, static_cast<double>(conv.y.reach())));
+  const double most = static_cast<double>(scale) * tap;
+  const double rounded = most + most * 4 * static_cast<double>(std::numeric_limits<T>::epsilon());
+  return 1 + static_cast<int64_t>(std::min(rounded, static_cast<double>(conv.y.reach())));
 }
 
-// The input rows within a spread of output rows, one row to spare on each side.
+// The input rows within a spread of output rows: both rows around a sample.
 inline Rows rows_around(const Conv& conv, Rows rows, int64_t spread) {
   const auto clamp = [&](int64_t row) { return std::min(std::max<int64_t>(row, 0), conv.y.in); };
-  return {clamp(conv.y.centre_floor(rows.begin) - spread - 1),
-          clamp(conv.y.centre_floor(rows.end - 1) + spread + 3)};
+  return {clamp(conv.y.centre_floor(rows.begin) - spread),
+          clamp(conv.y.centre_floor(rows.end - 1) + spread + 2)};
+}
+
+// The largest spread for which the rows around two runs of output rows, so many rows between them,
+// are apart.
+inline int64_t spread_apart(const Conv& conv, int64_t rows_between) {
+  return (conv.y.stride * (rows_between + 1) - 2) / 2;
 }
 
 // copies: the pass copies rows, so their number should be bounded; row: elements of an input row.
@@ -76,13 +84,15 @@ std::vector<Pass> make_passes(const Conv& conv, const View& scale, bool copies, 
       reach[static_cast<size_t>(y)] = rows_around(conv, {y, y + 1}, spread_of(conv, largest));
       most = std::max(most, reach[static_cast<size_t>(y)].count());
     }
+    const int64_t shares = (conv.y.in + most - 1) / most;  // a small last pass feeds few threads
+    const int64_t most_out = (conv.y.out + shares - 1) / shares;
     const size_t start = passes.size();
     for (int64_t y = 0; y < conv.y.out; ++y) {
       const Rows needed = reach[static_cast<size_t>(y)];
       if (passes.size() > start) {
         Pass& last = passes.back();
         const Rows both{std::min(last.in.begin, needed.begin), std::max(last.in.end, needed.end)};
-        if (both.count() <= most) {
+        if (both.count() <= most && last.out.count() < most_out) {
           last.in = both;
           last.out.end = y + 1;
           continue;

@@ -34,24 +34,18 @@ struct AxisTable {
   }
 };
 
-// Where rows of the gradient lie, in bytes from the image's first row of the pass. A task has its
-// own rows in place, and the ones before and after them apart, as far as it reaches; what taps send
-// further is added when all tasks are done, and nothing else then.
+// The rows of the gradient that a task scatters to; what taps send further is added when all tasks
+// are done, and nothing else then.
 struct RowPlaces {
-  int64_t begin = 0, end = 0;              // own rows
-  int64_t reach_begin = 0, reach_end = 0;  // with the rows apart
-  int64_t step = 0;
-  int64_t before = 0, own = 0, after = 0;  // where row 0 would be in each
-  int64_t nowhere = 0;                     // a row that nobody reads
+  int64_t begin = 0, end = 0;
+  int64_t step = 0;     // bytes
+  int64_t nowhere = 0;  // a row that nobody reads, bytes from row 0
   bool only_further = false;
   bool limited = false;  // some rows are sent to nowhere: comparisons that cost the others time
 
-  int64_t reached(int64_t row) const {
-    return row * step + (row < begin ? before : (row < end ? own : after));
-  }
   int64_t operator()(int64_t row) const {
-    const bool in_reach = (row >= reach_begin) & (row < reach_end);
-    return in_reach == only_further ? nowhere : (only_further ? row * step + own : reached(row));
+    const bool in_reach = (row >= begin) & (row < end);
+    return in_reach == only_further ? nowhere : row * step;
   }
 };
 
@@ -154,15 +148,13 @@ void fill_axis(const Axis& axis, const AxisSteps& steps, const T* __restrict sca
     if (steps.pixel != 0) fill_offsets(lo, sides, steps.pixel, table.pixel + at);
     if (steps.places != nullptr) {
       const RowPlaces places = *steps.places;
+      if (!places.limited) {
+        fill_offsets(lo, sides, places.step, table.write + at);
+        continue;
+      }
       for (int side = 0; side < sides; ++side) {
         int64_t* __restrict write = table.write + at + side * kTile;
-        if (places.limited) {
-          for (int m = 0; m < kTile; ++m) write[m] = places(static_cast<int64_t>(lo[m]) + side);
-        } else {
-          for (int m = 0; m < kTile; ++m) {
-            write[m] = places.reached(static_cast<int64_t>(lo[m]) + side);
-          }
-        }
+        for (int m = 0; m < kTile; ++m) write[m] = places(static_cast<int64_t>(lo[m]) + side);
       }
     }
   }
