@@ -7,7 +7,6 @@ class Backward {
         tensors_(tensors),
         executor_(executor),
         tile_(conv, tensors),
-        slots_wanted_(std::max<int64_t>(1, kTasks / units())),
         input_(conv, tile_.plan(), tensors.input),
         guide_(conv, tensors.guide),
         grad_input_(conv, tile_.plan(), tensors.grad_input) {
@@ -33,7 +32,7 @@ class Backward {
     int64_t partials = 1;
     for (const Pass& pass : passes) {
       slots.push_back(
-          make_slots<T>(conv_, tensors_.scale, pass, slots_wanted_, grad_input_.needed()));
+          make_slots<T>(conv_, tensors_.scale, pass, partials_wanted(), grad_input_.needed()));
       if (!slots.back().empty()) partials = std::max(partials, slots.back().back().partial + 1);
     }
     partials_ = Buffer<T>(partials * partial_elements());
@@ -63,6 +62,13 @@ class Backward {
   int64_t units() const { return static_cast<int64_t>(tile_.units().size()); }
   int64_t scale_elements(const Pass& pass) const {
     return conv_.scale_components * pass.out.count() * conv_.x.out;
+  }
+  // Enough to keep threads busy, but partials of large weights no larger than input or output.
+  int64_t partials_wanted() const {
+    const int64_t map = conv_.batch * std::max(conv_.y.in * input_.row_elements(),
+                                               conv_.y.out * conv_.x.out * conv_.out_channels);
+    return std::max<int64_t>(
+        1, std::min(kTasks / units(), map / std::max<int64_t>(1, weight_elements_)));
   }
   int64_t partial_elements() const { return weight_elements_ + tile_.bias_elements(); }
 
@@ -224,7 +230,6 @@ class Backward {
   const BackwardTensors& tensors_;
   const Executor& executor_;
   BackwardTile<T> tile_;
-  const int64_t slots_wanted_;
   InputRows<T> input_;
   GuideRows<T> guide_;
   GradientRows<T> grad_input_;
