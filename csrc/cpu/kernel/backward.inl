@@ -92,6 +92,7 @@ class Backward {
       for (const Slot& slot : slots) {
         if (slot.phase == phase) chosen.push_back(&slot);
       }
+      if (chosen.empty()) break;
       const int64_t tasks = static_cast<int64_t>(chosen.size()) * units();
       run_tasks(executor_, tasks, workers, [&](int worker, int64_t task) {
         const Slot& slot = *chosen[static_cast<size_t>(task / units())];
