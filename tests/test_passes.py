@@ -62,6 +62,16 @@ def test_passes_match_the_reference(pattern: object, stride: int, in_place: bool
         assert error < 2e-6, (name, error)
 
 
+def test_rows_longer_than_a_pass_that_no_tap_reaches() -> None:
+    x = torch.randn(1, 4, 1, 1_100_000, requires_grad=True)
+    weight = torch.randn(1, 4, 3, 1, requires_grad=True)
+    scale = torch.full((1, 4, 1_100_000), 0.5)
+    output = surf_conv2d(x, weight, scale=scale, stride=(30, 1), padding=(50, 0))
+    assert torch.equal(output, torch.zeros_like(output))
+    for gradient in torch.autograd.grad(output, (x, weight), torch.ones_like(output)):
+        assert torch.equal(gradient, torch.zeros_like(gradient))
+
+
 def test_half_gradients_of_passes_are_rounded_once() -> None:
     generator = torch.Generator().manual_seed(4)
     size = (HEIGHT, WIDTH)

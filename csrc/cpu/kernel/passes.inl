@@ -78,7 +78,7 @@ std::vector<Pass> make_passes(const Conv& conv, const View& scale, bool copies, 
   for (int64_t n = 0; n < conv.batch; ++n) {
     // Rows that one output row needs anyway cost the others no memory: a depth that is far too near
     // must not make a pass of every row that has one.
-    int64_t most = kElements / row;
+    int64_t most = std::max<int64_t>(1, kElements / row);
     for (int64_t y = 0; y < conv.y.out; ++y) {
       const T largest = largest_scale<T>(conv, scale, n, y * conv.x.out, conv.x.out);
       reach[static_cast<size_t>(y)] = rows_around(conv, {y, y + 1}, spread_of(conv, largest));
