@@ -33,7 +33,7 @@ class Backward {
     for (const Pass& pass : passes) {
       slots.push_back(
           make_slots<T>(conv_, tensors_.scale, pass, partials_wanted(), grad_input_.needed()));
-      if (!slots.back().empty()) partials = std::max(partials, slots.back().back().partial + 1);
+      partials = std::max(partials, slots.back().back().partial + 1);
     }
     partials_ = Buffer<T>(partials * partial_elements());
     clear_partials(partials);
@@ -72,9 +72,9 @@ class Backward {
   }
   int64_t partial_elements() const { return weight_elements_ + tile_.bias_elements(); }
 
-  void clear_partials(int64_t partials) {
+  void clear_partials(int64_t count) {
     const int64_t elements = partial_elements();
-    run_tasks(executor_, partials, workers_for(executor_, partials, partials * elements / 4),
+    run_tasks(executor_, count, workers_for(executor_, count, count * elements / 4),
               [&](int, int64_t i) { std::fill_n(partials_.get() + i * elements, elements, T(0)); });
   }
 
@@ -115,13 +115,13 @@ class Backward {
       if (grad_scale_) {
         target.scale = grad_scale_.get() + (unit * pass.images + i) * scale_elements(pass);
       }
-      run_tiles(scratch, pass, slot, i, unit, target, slot.far, false);
+      run_tiles(scratch, pass, slot, i, unit, target, false);
     }
   }
 
   // All tiles of an image of the pass; or only those that reach further than their slot.
   void run_tiles(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
-                 int64_t image, int64_t unit, typename BackwardTile<T>::Target target, bool limited,
+                 int64_t image, int64_t unit, typename BackwardTile<T>::Target target,
                  bool only_further) {
     constexpr int64_t bytes = sizeof(T);
     const int64_t n = pass.first_image + image, end = slot.out.end * conv_.x.out;
@@ -134,7 +134,7 @@ class Backward {
                 grad_input_.row_elements() * bytes,
                 byte_distance(target.grad_input, scratch.discard),
                 only_further,
-                limited};
+                slot.far};
     }
     const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in,
                             grad_input_.needed() ? &places : nullptr};
@@ -167,7 +167,7 @@ class Backward {
       for (const Slot& slot : slots) {
         if (!slot.far) continue;
         run_tiles(scratch[static_cast<size_t>(worker)], pass, slot, slot.first_image, unit, {},
-                  true, true);
+                  true);
       }
     });
   }
