@@ -54,8 +54,8 @@ struct Axis {
   }
 };
 
-// Where samples fall: between pixel `lo` and `lo + 1`, `fraction` of the way. All members are
-// vectors of as many lanes; masks hold 0 or -1.
+// Where samples fall: between pixel `lo` and `lo + 1`, counted from centre_floor, `fraction` of the
+// way. All members are vectors of as many lanes; masks hold 0 or -1.
 template <class Real, class Integer>
 struct Position {
   Integer lo;
@@ -63,14 +63,14 @@ struct Position {
   Integer reachable;  // 0: not finite, or so far away that no image reaches it
 };
 
-// Real and Integer are vectors of floating-point numbers and integers; centre is centre_floor, half
-// is 0.5 where centres lie between pixels, else 0. limit bounds the offset so that centre + offset
-// fits in a lane of Integer.
+// Real and Integer are vectors of floating-point numbers and integers; half is 0.5 where centres
+// lie between pixels, else 0. limit bounds the offset so that it fits in a lane of Integer together
+// with centre_floor.
 // A sample exactly on a pixel counts to the cell it moves into as the scale grows: then the
 // derivatives of all taps are the same one-sided derivative. Descending: the tap is negative.
 template <bool Descending, class Real, class Integer, class T>
-inline __attribute__((always_inline)) Position<Real, Integer> locate(Integer centre, T half, T tap,
-                                                                     Real scale, T limit) {
+inline __attribute__((always_inline)) Position<Real, Integer> locate(T half, T tap, Real scale,
+                                                                     T limit) {
   Real offset = half + scale * tap;
   const auto near = (offset < limit) & (offset > -limit);  // NaN compares false
   offset = near ? offset : Real{};
@@ -78,8 +78,15 @@ inline __attribute__((always_inline)) Position<Real, Integer> locate(Integer cen
   const Real truncated = __builtin_convertvector(whole, Real);
   const auto above = Descending ? truncated >= offset : truncated > offset;
   whole += __builtin_convertvector(above, Integer);
-  return {centre + whole, offset - __builtin_convertvector(whole, Real),
+  return {whole, offset - __builtin_convertvector(whole, Real),
           __builtin_convertvector(near, Integer)};
+}
+
+// The opposite tap, of a centre on a pixel.
+template <class Real, class Integer>
+inline __attribute__((always_inline)) Position<Real, Integer> opposite(
+    const Position<Real, Integer>& position) {
+  return {-1 - position.lo, 1 - position.fraction, position.reachable};
 }
 
 }  // namespace surfconv

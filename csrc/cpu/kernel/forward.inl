@@ -98,7 +98,7 @@ class Forward {
       return;
     }
     if (few_) {
-      weights_ = pack_few<T>(few_, plan_, tensors_.weight, conv_.x.kernel);
+      weights_ = pack_few<T>(few_, conv_, plan_, tensors_.weight);
       return;
     }
     const int64_t depth = plan_.taps * plan_.row;
@@ -121,7 +121,8 @@ class Forward {
     const int64_t unseen = byte_distance(base, unseen_.data());
     const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in};
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
-    scratch.tile.place(tensors_.scale, guide_.image(n), n, begin, count, steps_y, steps_x);
+    scratch.tile.template place<false>(tensors_.scale, guide_.image(n), n, begin, count, steps_y,
+                                       steps_x);
     // Straight into the output where whole blocks of the product fit there.
     const bool direct = writes_rows_ && (fused_ || few_ || count % kRowPad == 0);
     const int64_t ld_out = direct ? tensors_.output.x : plan_.groups * width_;

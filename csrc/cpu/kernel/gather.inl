@@ -78,7 +78,7 @@ void gather_tap(const TapCorners<T>& tap, const char* base, int begin, int end, 
 
 // Whole rows of taps of the interior pixels begin .. end-1, one tap after the other, a step apart,
 // at to + m * ld.
-template <int KX, class T, class Channels>
+template <int K, class T, class Channels>
 void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
                      const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
                      int64_t step) {
@@ -86,7 +86,7 @@ void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, 
   const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
     T* out = to + m * ld;
-    walk_taps<KX, W>(
+    walk_taps<K, W>(
         axis_y, axis_x, rows, columns, taps_y, m,
         [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t) SURFCONV_INLINED {
           T* place = out + t * step;
@@ -97,22 +97,22 @@ void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, 
   }
 }
 
-template <int KX, class T, class Channels>
+template <int K, class T, class Channels>
 void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
                  const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
                  int64_t step) {
   const Axis axis_y = conv.y, axis_x = conv.x;
   for (int m = begin; m < end; ++m) {
     T* out = to + m * ld;
-    walk_grid<KX>(axis_y, axis_x, rows, columns, taps_y, m,
-                  [&](auto, auto, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
-                      SURFCONV_INLINED {
-                        T* place = out + t * step;
-                        const T* from = reinterpret_cast<const T*>(base + y.read + x.read);
-                        for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-                          store(place + c, load<Vec<T, decltype(width)::lanes>>(from + c));
-                        });
-                      });
+    walk_grid<K>(axis_y, axis_x, rows, columns, taps_y, m,
+                 [&](auto, auto, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
+                     SURFCONV_INLINED {
+                       T* place = out + t * step;
+                       const T* from = reinterpret_cast<const T*>(base + y.read + x.read);
+                       for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
+                         store(place + c, load<Vec<T, decltype(width)::lanes>>(from + c));
+                       });
+                     });
   }
 }
 
@@ -158,13 +158,14 @@ void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64
         return gather_seen(conv, tile.rows(), tile.columns(), taps_y, base, run.begin, run.end,
                            known, to, ld, step);
       }
-      with_width(conv.x.kernel, [&](auto width) {
+      with_kernel(conv, taps_y, [&](auto kernel) {
         if (run.place == Place::on_grid) {
-          return gather_grid<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y,
-                                                     base, run.begin, run.end, known, to, ld, step);
+          return gather_grid<decltype(kernel)::value>(conv, tile.rows(), tile.columns(), taps_y,
+                                                      base, run.begin, run.end, known, to, ld,
+                                                      step);
         }
-        gather_interior<decltype(width)::value>(conv, tile.rows(), tile.columns(), taps_y, base,
-                                                run.begin, run.end, known, to, ld, step);
+        gather_interior<decltype(kernel)::value>(conv, tile.rows(), tile.columns(), taps_y, base,
+                                                 run.begin, run.end, known, to, ld, step);
       });
     });
   });

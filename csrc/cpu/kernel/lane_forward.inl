@@ -71,8 +71,6 @@ __attribute__((noinline)) void lane_pixels(const LaneScratch<T>& scratch, int m,
                                            int64_t step_y, int64_t step_x, Fixed<N>,
                                            const T* weight, int64_t weight_step, const T* initial,
                                            T* out, int64_t ld_out) {
-  using One = std::integral_constant<int, 1>;
-  using Two = std::integral_constant<int, 2>;
   constexpr int L = widest_lanes<T>(Fixed<N>{}), VECTORS = N / L;
   using V = Vec<T, L>;
   const SeenAxis<T> rows = scratch.rows, columns = scratch.columns;
@@ -207,7 +205,7 @@ void lane_forward(const Conv& conv, const Plan& plan, const Tile<T>& tile,
         if (PIXELS > 1 && m + 1 < run.end && differs[m] == 0) {
           some(std::integral_constant<int, PIXELS>{});
         } else {
-          some(std::integral_constant<int, 1>{});
+          some(One{});
         }
       }
     });

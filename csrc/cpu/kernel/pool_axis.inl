@@ -45,9 +45,8 @@ void locate_pool(const Axis& axis, T half, T tap, const T* __restrict scale,
   const auto as_integer = [](Mask mask) { return __builtin_convertvector(mask, Integer); };
   for (int m = 0; m < kTile; m += lanes) {
     const Real own_scale = load<Real>(scale + m);
-    const auto position =
-        locate<Descending>(load<Integer>(centre + m), half, tap, own_scale, limit);
-    const Integer near = position.reachable, lo = position.lo;
+    const auto position = locate<Descending, Real, Integer>(half, tap, own_scale, limit);
+    const Integer near = position.reachable, lo = load<Integer>(centre + m) + position.lo;
     // In steps of what 1 - fraction can tell: a quotient of weights keeps its precision where the
     // guide leaves nothing but a corner that is all but at its end.
     Real fraction = one - (one - position.fraction);

@@ -56,7 +56,7 @@ SURFCONV_INLINE void scatter_place(const ScatterTarget<T>& target, const TapSide
 }
 
 // Whole rows of taps of the interior pixels begin .. end-1.
-template <bool Writes, Slopes S, int KX, class T, class Channels>
+template <bool Writes, Slopes S, int K, class T, class Channels>
 void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
                       ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
                       int64_t ld) {
@@ -65,12 +65,12 @@ void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns,
   for (int m = begin; m < end; ++m) {
     PixelDot<T, Channels> dot(target, m);
     T* row = matrix + m * ld;
-    walk_taps<KX, W>(axis_y, axis_x, rows, columns, taps_y, m,
-                     [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t)
-                         SURFCONV_INLINED {
-                           scatter_place<decltype(r)::value, decltype(c)::value, Writes, S>(
-                               target, y, x, channels, row + t * count_of(channels), dot);
-                         });
+    walk_taps<K, W>(axis_y, axis_x, rows, columns, taps_y, m,
+                    [&](auto r, auto c, const TapSide<W>& y, const TapSide<W>& x, int64_t t)
+                        SURFCONV_INLINED {
+                          scatter_place<decltype(r)::value, decltype(c)::value, Writes, S>(
+                              target, y, x, channels, row + t * count_of(channels), dot);
+                        });
     if constexpr (S != Slopes::none) dot.finish();
     if constexpr (S == Slopes::two) dot.finish_x();
   }
@@ -78,7 +78,7 @@ void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns,
 
 // Whole rows of taps of the pixels begin .. end-1, which are on the grid: the derivative is the
 // step to the pixel that a tap moves towards.
-template <bool Writes, Slopes S, int KX, class T, class Channels>
+template <bool Writes, Slopes S, int K, class T, class Channels>
 void scatter_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
                   ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
                   int64_t ld) {
@@ -86,37 +86,37 @@ void scatter_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Row
   for (int m = begin; m < end; ++m) {
     PixelDot<T, Channels> dot(target, m);
     T* row = matrix + m * ld;
-    walk_grid<KX>(axis_y, axis_x, rows, columns, taps_y, m,
-                  [&](auto r, auto c, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
-                      SURFCONV_INLINED {
-                        constexpr bool Down = S != Slopes::none && decltype(r)::value == 2;
-                        constexpr bool Aside = S != Slopes::none && decltype(c)::value == 2;
-                        const auto read = [&](bool inside, int64_t offset) SURFCONV_INLINED {
-                          return inside ? reinterpret_cast<const T*>(target.read + offset)
-                                        : target.zeros;
-                        };
-                        T* place = row + t * count_of(channels);
-                        const T* from = read(true, y.read + x.read);
-                        const T* below = read(Down && !y.at_border, y.beyond + x.read);
-                        const T* beside = read(Aside && !x.at_border, y.read + x.beyond);
-                        T* to = nullptr;
-                        if constexpr (Writes)
-                          to = reinterpret_cast<T*>(target.write + y.write + x.read);
-                        for_channels<T>(channels, [&](int64_t k, auto width) SURFCONV_INLINED {
-                          using V = Vec<T, decltype(width)::lanes>;
-                          const V gradient = load<V>(place + k), sample = load<V>(from + k);
-                          V along{}, along_x{};
-                          if constexpr (Down) along = (load<V>(below + k) - sample) * y.tap;
-                          if constexpr (Aside) along_x = (load<V>(beside + k) - sample) * x.tap;
-                          if constexpr (S == Slopes::one && (Down || Aside)) {
-                            dot.add(V(along + along_x), gradient);
-                          }
-                          if constexpr (S == Slopes::two && Down) dot.add(along, gradient);
-                          if constexpr (S == Slopes::two && Aside) dot.add_x(along_x, gradient);
-                          if constexpr (Writes) store(to + k, V(load<V>(to + k) + gradient));
-                          store(place + k, sample);
-                        });
-                      });
+    walk_grid<K>(axis_y, axis_x, rows, columns, taps_y, m,
+                 [&](auto r, auto c, const GridSide<T>& y, const GridSide<T>& x, int64_t t)
+                     SURFCONV_INLINED {
+                       constexpr bool Down = S != Slopes::none && decltype(r)::value == 2;
+                       constexpr bool Aside = S != Slopes::none && decltype(c)::value == 2;
+                       const auto read = [&](bool inside, int64_t offset) SURFCONV_INLINED {
+                         return inside ? reinterpret_cast<const T*>(target.read + offset)
+                                       : target.zeros;
+                       };
+                       T* place = row + t * count_of(channels);
+                       const T* from = read(true, y.read + x.read);
+                       const T* below = read(Down && !y.at_border, y.beyond + x.read);
+                       const T* beside = read(Aside && !x.at_border, y.read + x.beyond);
+                       T* to = nullptr;
+                       if constexpr (Writes)
+                         to = reinterpret_cast<T*>(target.write + y.write + x.read);
+                       for_channels<T>(channels, [&](int64_t k, auto width) SURFCONV_INLINED {
+                         using V = Vec<T, decltype(width)::lanes>;
+                         const V gradient = load<V>(place + k), sample = load<V>(from + k);
+                         V along{}, along_x{};
+                         if constexpr (Down) along = (load<V>(below + k) - sample) * y.tap;
+                         if constexpr (Aside) along_x = (load<V>(beside + k) - sample) * x.tap;
+                         if constexpr (S == Slopes::one && (Down || Aside)) {
+                           dot.add(V(along + along_x), gradient);
+                         }
+                         if constexpr (S == Slopes::two && Down) dot.add(along, gradient);
+                         if constexpr (S == Slopes::two && Aside) dot.add_x(along_x, gradient);
+                         if constexpr (Writes) store(to + k, V(load<V>(to + k) + gradient));
+                         store(place + k, sample);
+                       });
+                     });
     if constexpr (S != Slopes::none) dot.finish();
     if constexpr (S == Slopes::two) dot.finish_x();
   }
@@ -193,14 +193,14 @@ void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int6
         return scatter_seen<Writes, S>(conv, tile.rows(), tile.columns(), taps_y, target, run.begin,
                                        run.end, known, matrix, ld);
       }
-      with_width(conv.x.kernel, [&](auto width) {
-        constexpr int KX = decltype(width)::value;
+      with_kernel(conv, taps_y, [&](auto kernel) {
+        constexpr int K = decltype(kernel)::value;
         if (run.place == Place::on_grid) {
-          return scatter_grid<Writes, S, KX>(conv, tile.rows(), tile.columns(), taps_y, target,
-                                             run.begin, run.end, known, matrix, ld);
+          return scatter_grid<Writes, S, K>(conv, tile.rows(), tile.columns(), taps_y, target,
+                                            run.begin, run.end, known, matrix, ld);
         }
-        scatter_interior<Writes, S, KX>(conv, tile.rows(), tile.columns(), taps_y, target,
-                                        run.begin, run.end, known, matrix, ld);
+        scatter_interior<Writes, S, K>(conv, tile.rows(), tile.columns(), taps_y, target, run.begin,
+                                       run.end, known, matrix, ld);
       });
     });
   });

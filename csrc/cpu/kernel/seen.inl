@@ -35,8 +35,6 @@ template <bool Writes, Slopes S, class T, class Body>
 SURFCONV_INLINE void walk_seen(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
                                const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
   using Zero = std::integral_constant<int, 0>;
-  using One = std::integral_constant<int, 1>;
-  using Two = std::integral_constant<int, 2>;
   SeenSide<T> seen_x[kMostTaps];
   int places_x[kMostTaps];
   for (int64_t tx = 0; tx < axis_x.kernel; ++tx) {

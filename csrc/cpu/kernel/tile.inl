@@ -47,14 +47,19 @@ class Tile {
   }
 
   // Flat output pixels first .. first+count-1 of image n.
+  template <bool Presence>
   void place(const View& scale, const GuideImage<T>& guide, int64_t n, int64_t first, int count,
              AxisSteps steps_y, AxisSteps steps_x) {
     if (guide.value == nullptr) steps_y.pixel = steps_x.pixel = 0;
-    T scale_y[kTile] = {}, scale_x_own[kTile] = {};
-    load_pixels<T>(scale, n, 0, 1, conv_.x.out, first, count, scale_y, 1, 1);
+    T scale_y[kTile], scale_x_own[kTile];
+    const auto load_scale = [&](int64_t component, T* to) {
+      load_pixels<T>(scale, n, component, 1, conv_.x.out, first, count, to, 1, 1);
+      std::fill(to + count, to + kTile, T(0));
+    };
+    load_scale(0, scale_y);
     const T* scale_x = scale_y;
     if (conv_.scale_components == 2) {
-      load_pixels<T>(scale, n, 1, 1, conv_.x.out, first, count, scale_x_own, 1, 1);
+      load_scale(1, scale_x_own);
       scale_x = scale_x_own;
     }
     guide_.image = guide.value;
@@ -67,8 +72,13 @@ class Tile {
       using Int = decltype(index);
       Int centre_y[kTile], centre_x[kTile];
       find_centres(first, count, centre_y, centre_x);
-      fill_axis<T, Int>(conv_.y, steps_y, scale_y, centre_y, rows_, bounds);
-      fill_axis<T, Int>(conv_.x, steps_x, scale_x, centre_x, columns_, bounds);
+      if (Presence || guide.value != nullptr) {
+        fill_axis<true>(conv_.y, steps_y, scale_y, centre_y, rows_, bounds);
+        fill_axis<true>(conv_.x, steps_x, scale_x, centre_x, columns_, bounds);
+      } else {
+        fill_axis<false>(conv_.y, steps_y, scale_y, centre_y, rows_, bounds);
+        fill_axis<false>(conv_.x, steps_x, scale_x, centre_x, columns_, bounds);
+      }
     };
     if (sizeof(T) == 4 && narrow_) {
       fill(std::conditional_t<sizeof(T) == 4, int32_t, int64_t>{});

@@ -4,7 +4,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "vec.inl"
 #include "workspace.inl"
 #include "pixels.inl"
-#include "samples.inl"
+#include "axis.inl"
 #include "pool_axis.inl"
 #include "pool_corners.inl"
 #include "pool_samples.inl"

@@ -121,17 +121,21 @@ SURFCONV_INLINE void for_channels(int64_t channels, const Body& body) {
   }
 }
 
-// Halves by halves: lane by lane each addition would wait for the one before it.
-template <class T, class V>
-SURFCONV_INLINE T sum_lanes(V v) {
-  constexpr int lanes = static_cast<int>(sizeof(V) / sizeof(T));
-  if constexpr (lanes == 1) {
-    return v[0];
+// The sum of a vector's parts, each as long as V.
+template <class V, class T, class Whole>
+SURFCONV_INLINE V fold(Whole v) {
+  if constexpr (sizeof(Whole) == sizeof(V)) {
+    return v;
   } else {
-    using Half = Vec<T, lanes / 2>;
+    using Half = Vec<T, static_cast<int>(sizeof(Whole) / sizeof(T)) / 2>;
     Half lower, upper;
     __builtin_memcpy(&lower, &v, sizeof(Half));
     __builtin_memcpy(&upper, reinterpret_cast<const char*>(&v) + sizeof(Half), sizeof(Half));
-    return sum_lanes<T>(Half(lower + upper));
+    return fold<V, T>(Half(lower + upper));
   }
+}
+// Halves by halves: lane by lane each addition would wait for the one before it.
+template <class T, class V>
+SURFCONV_INLINE T sum_lanes(V v) {
+  return fold<Vec<T, 1>, T>(v)[0];
 }

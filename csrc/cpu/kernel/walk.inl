@@ -30,51 +30,63 @@ struct TapSide {
 };
 
 template <bool TWO, class W, class T>
-SURFCONV_INLINE TapSide<W> tap_side(const int64_t* read, const int64_t* write, const T* weight,
-                                    T tap) {
+SURFCONV_INLINE TapSide<W> tap_side(const Axis& axis, const AxisTable<T>& table, int64_t t, int m) {
+  const int64_t at = 2 * t * kTile + m;
+  const int64_t *read = table.read + at, *write = table.write + at;
+  const T* weight = table.weight + at;
   if constexpr (TWO) {
     return {{read[0], read[kTile]},
             {write[0], write[kTile]},
             {weight_of<W>(weight[0]), weight_of<W>(weight[kTile])},
-            weight_of<W>(tap)};
+            weight_of<W>(static_cast<T>(axis.tap_doubled(t)) / 2)};
   }
   return {{read[0], 0}, {write[0], 0}, {weight_of<W>(T(1)), W{}}, W{}};
 }
 
+// How many places along an axis a tap has.
+using One = std::integral_constant<int, 1>;
+using Two = std::integral_constant<int, 2>;
+
+// body(rows of corners, tap along y, number of its first tap) for the rows taps_y of the kernel. K:
+// the size of a square kernel that is walked whole, else 0: then loops are unrolled.
+template <int K, class Body>
+SURFCONV_INLINE void walk_rows(const Axis& axis_y, const Axis& axis_x, Rows taps_y,
+                               const Body& body) {
+  if constexpr (K == 3) {
+    body(Two{}, 0, 0);
+    body(One{}, 1, K);
+    body(Two{}, 2, 2 * K);
+  } else {
+    for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty) {
+      const int64_t t = (ty - taps_y.begin) * axis_x.kernel;
+      axis_y.fixed(ty) ? body(One{}, ty, t) : body(Two{}, ty, t);
+    }
+  }
+}
+
+// body(columns of corners, tap along x) for a row of the kernel, without a branch in the loops.
+template <int K, class Body>
+SURFCONV_INLINE void walk_columns(const Axis& axis_x, const Body& body) {
+  const int64_t kernel = K > 0 ? K : axis_x.kernel;
+  const int64_t fixed = K > 0 ? K / 2 : axis_x.fixed_tap(), before = fixed < 0 ? kernel : fixed;
+  for (int64_t tx = 0; tx < before; ++tx) body(Two{}, tx);
+  if (fixed < 0) return;
+  body(One{}, fixed);
+  for (int64_t tx = fixed + 1; tx < kernel; ++tx) body(Two{}, tx);
+}
+
 // body(rows, columns, y, x, t) for each tap in the rows taps_y of the kernel: constants that say
-// how many rows and columns of corners the tap has, its sides and its number from the first. KX:
-// the kernel's odd width where it is known, else 0. W: the type of the weights.
-template <int KX, class W, class T, class Body>
+// how many rows and columns of corners the tap has, its sides and its number from the first. W: the
+// type of the weights.
+template <int K, class W, class T, class Body>
 SURFCONV_INLINE void walk_taps(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
                                const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
-  using One = std::integral_constant<int, 1>;
-  using Two = std::integral_constant<int, 2>;
-  const int64_t kernel_x = KX > 0 ? KX : axis_x.kernel;
-  const int64_t fixed_x = KX > 0 ? KX / 2 : axis_x.fixed_tap();
-  const int64_t before = fixed_x < 0 ? kernel_x : fixed_x;
-  int64_t at_y = taps_y.begin * 2 * kTile + m, t = 0;
-  for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty, at_y += 2 * kTile) {
-    const auto walk_row = [&](auto rows_of_tap) SURFCONV_INLINED {
-      constexpr bool two_rows = decltype(rows_of_tap)::value == 2;
-      const T tap_y = static_cast<T>(axis_y.tap_doubled(ty)) / 2;
-      const TapSide<W> y =
-          tap_side<two_rows, W>(rows.read + at_y, rows.write + at_y, rows.weight + at_y, tap_y);
-      const auto walk_columns = [&](int64_t begin, int64_t end) SURFCONV_INLINED {
-        const int64_t* read = columns.read + begin * 2 * kTile + m;
-        const T* weight = columns.weight + begin * 2 * kTile + m;
-        for (int64_t tx = begin; tx < end; ++tx, ++t, read += 2 * kTile, weight += 2 * kTile) {
-          const T tap_x = static_cast<T>(axis_x.tap_doubled(tx)) / 2;
-          body(rows_of_tap, Two{}, y, tap_side<true, W>(read, read, weight, tap_x), t);
-        }
-      };
-      walk_columns(0, before);
-      if (before == kernel_x) return;
-      const int64_t* read = columns.read + before * 2 * kTile + m;
-      body(rows_of_tap, One{}, y, tap_side<false, W>(read, read, columns.weight, T(0)), t++);
-      walk_columns(before + 1, kernel_x);
-    };
-    axis_y.fixed(ty) ? walk_row(One{}) : walk_row(Two{});
-  }
+  walk_rows<K>(axis_y, axis_x, taps_y, [&](auto r, int64_t ty, int64_t t) SURFCONV_INLINED {
+    const auto y = tap_side<decltype(r)::value == 2, W>(axis_y, rows, ty, m);
+    walk_columns<K>(axis_x, [&](auto c, int64_t tx) SURFCONV_INLINED {
+      body(r, c, y, tap_side<decltype(c)::value == 2, W>(axis_x, columns, tx, m), t + tx);
+    });
+  });
 }
 
 // A tap along one axis of a pixel on the grid. Bytes.
@@ -86,41 +98,28 @@ struct GridSide {
   T tap;                // magnitude of tap(t)
 };
 
-template <bool TWO, class T>
+template <int K, bool TWO, class T>
 SURFCONV_INLINE GridSide<T> grid_side(const Axis& axis, const AxisTable<T>& table, int64_t t,
                                       int m) {
-  // The side towards the centre holds the tap: see locate.
-  const int64_t tap = axis.tap_doubled(t), at = 2 * t * kTile + m;
-  const int64_t near = TWO && tap < 0 ? at + kTile : at, far = near == at ? at + kTile : at;
+  // The side towards the centre holds the tap: see locate
+  const int64_t kernel = K > 0 ? K : axis.kernel, at = 2 * t * kTile + m;
+  const int64_t near = TWO && t < kernel / 2 ? at + kTile : at, far = near == at ? at + kTile : at;
   if constexpr (!TWO) return {table.read[near], table.write[near], 0, true, T(0)};
   return {table.read[near], table.write[near], table.read[far], table.inside[far] == 0,
-          static_cast<T>(std::abs(tap)) / 2};
+          static_cast<T>(std::abs(axis.tap_doubled(t))) / 2};
 }
 
 // body(rows, columns, y, x, t) for each tap of a pixel on the grid, as walk_taps has it: the tap is
 // one corner of weight 1, and rows and columns say along which axes it moves with the scale.
-template <int KX, class T, class Body>
+template <int K, class T, class Body>
 SURFCONV_INLINE void walk_grid(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
                                const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
-  using One = std::integral_constant<int, 1>;
-  using Two = std::integral_constant<int, 2>;
-  const int64_t kernel_x = KX > 0 ? KX : axis_x.kernel;
-  const int64_t fixed_x = KX > 0 ? KX / 2 : axis_x.fixed_tap();
-  int64_t t = 0;
-  for (int64_t ty = taps_y.begin; ty < taps_y.end; ++ty) {
-    const auto walk_row = [&](auto rows_of_tap) SURFCONV_INLINED {
-      const auto y = grid_side<decltype(rows_of_tap)::value == 2>(axis_y, rows, ty, m);
-#pragma GCC unroll 3
-      for (int64_t tx = 0; tx < kernel_x; ++tx, ++t) {
-        if (tx == fixed_x) {
-          body(rows_of_tap, One{}, y, grid_side<false>(axis_x, columns, tx, m), t);
-        } else {
-          body(rows_of_tap, Two{}, y, grid_side<true>(axis_x, columns, tx, m), t);
-        }
-      }
-    };
-    axis_y.fixed(ty) ? walk_row(One{}) : walk_row(Two{});
-  }
+  walk_rows<K>(axis_y, axis_x, taps_y, [&](auto r, int64_t ty, int64_t t) SURFCONV_INLINED {
+    const auto y = grid_side<K, decltype(r)::value == 2>(axis_y, rows, ty, m);
+    walk_columns<K>(axis_x, [&](auto c, int64_t tx) SURFCONV_INLINED {
+      body(r, c, y, grid_side<K, decltype(c)::value == 2>(axis_x, columns, tx, m), t + tx);
+    });
+  });
 }
 
 // The corners of a tap, row by row: where they are and what they weigh.
@@ -144,8 +143,11 @@ SURFCONV_INLINE Corners<ROWS, COLUMNS, T, W> corners_of(const char* base, const 
   return corners;
 }
 
-// body(kernel's width as a constant) where it is one that nets have, else 0.
+// body(K as a constant), see walk_rows.
 template <class Body>
-SURFCONV_INLINE void with_width(int64_t kernel_x, const Body& body) {
-  kernel_x == 3 ? body(std::integral_constant<int, 3>{}) : body(std::integral_constant<int, 0>{});
+SURFCONV_INLINE void with_kernel(const Conv& conv, Rows taps_y, const Body& body) {
+  if (taps_y.count() == 3 && conv.y.kernel == 3 && conv.x.kernel == 3) {
+    return body(std::integral_constant<int, 3>{});
+  }
+  body(std::integral_constant<int, 0>{});
 }
