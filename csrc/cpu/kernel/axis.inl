@@ -15,6 +15,10 @@ SURFCONV_INLINE bool has_narrow_reach(const Axis& y, const Axis& x) {
 // Derivatives by how many components of the scale are asked for.
 enum class Slopes { none, one, two };
 
+// So far from any centre that no image reaches it, and yet their sum does not overflow.
+template <class Int>
+constexpr Int kFar = Int{1} << (sizeof(Int) == 4 ? 29 : 61);
+
 // Per axis, tap and side (pixel `lo`, then `lo + 1`), one entry for each pixel of the tile.
 template <class T>
 struct AxisTable {
@@ -92,8 +96,8 @@ struct Sides {
   Real lower, upper;
 };
 
-// Stores one tap of some pixels, `lo` counted from the first pixel of the image: the lower pixel,
-// then weight and presence of both. Returns the weights, 0 outside the image.
+// Stores one tap of some pixels: the lower pixel, counted from the image's first, then weight and
+// presence of both. Returns the weights, 0 outside the image.
 template <bool Presence, class T, class Int, class Real, class Integer>
 SURFCONV_INLINE Sides<Real> store_tap(const Position<Real, Integer>& tap, Integer centre, Int last,
                                       Int* lo, T* weight, T* inside) {
@@ -101,9 +105,7 @@ SURFCONV_INLINE Sides<Real> store_tap(const Position<Real, Integer>& tap, Intege
   using Lane = std::make_unsigned_t<Int>;
   using Unsigned = Vec<Lane, sizeof(Integer) / sizeof(Int)>;
   const Real zero{}, one = zero + T(1);
-  // So far away that no image reaches it, and yet no overflow.
-  const Integer far = Integer{} + (Int{1} << (sizeof(Int) == 4 ? 29 : 61));
-  const Integer at = centre + (tap.reachable ? tap.lo : far);
+  const Integer at = centre + (tap.reachable ? tap.lo : Integer{} + kFar<Int>);
   const auto from_first = (Unsigned)at;  // before the first, it is the largest of numbers
   const auto lower_in = from_first <= static_cast<Lane>(last);
   const auto upper_in = from_first + 1 <= static_cast<Lane>(last);
@@ -136,7 +138,7 @@ void locate_pair(const Axis& axis, int64_t t, const T* __restrict scale,
   T* __restrict inside_opposite = table.inside + at_opposite;
   const T tap = static_cast<T>(axis.tap_doubled(axis.kernel - 1 - t)) / 2;
   const T half = Half ? T(0.5) : T(0);
-  const T limit = static_cast<T>(int64_t{1} << (sizeof(Int) == 4 ? 29 : 61));
+  const T limit = static_cast<T>(kFar<Int>);
   const Int last = static_cast<Int>(axis.in - 1);
   for (int m = 0; m < kTile; m += lanes) {
     const Real own = load<Real>(scale + m);

@@ -38,7 +38,7 @@ void locate_pool(const Axis& axis, T half, T tap, const T* __restrict scale,
   using Integer = Vec<Int, lanes>;
   using Mask = decltype(Real{} > Real{});
   constexpr T kLargest = std::numeric_limits<T>::max();
-  const T limit = static_cast<T>(int64_t{1} << (sizeof(Int) == 4 ? 29 : 61));
+  const T limit = static_cast<T>(kFar<Int>);
   const Int last = static_cast<Int>(axis.in - 1);
   const Real zero{}, one = zero + T(1);
   const auto as_mask = [](Integer mask) { return __builtin_convertvector(mask, Mask); };
