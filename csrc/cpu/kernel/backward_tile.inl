@@ -116,7 +116,7 @@ class BackwardTile {
   void run(Scratch& scratch, const Unit& unit, const Target& target, const GuideImage<T>& guide,
            int64_t n, int64_t begin, int count, const AxisSteps& steps_y,
            const AxisSteps& steps_x) const {
-    scratch.tile.template place<true>(tensors_.scale, guide, n, begin, count, steps_y, steps_x);
+    scratch.tile.place(tensors_.scale, guide, n, begin, count, steps_y, steps_x, true);
     const Gradients gradients = output_.read(unit, n, begin, count, scratch.grad_out);
     if (target.bias != nullptr) output_.add_bias(gradients, unit, count, target.bias);
     std::fill(scratch.dot, scratch.dot + 2 * kTile * kLanes<T>, T(0));

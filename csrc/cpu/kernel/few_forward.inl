@@ -20,13 +20,12 @@ Few few_of(const Plan& plan, int64_t taps_at_once) {
 }
 
 // Columns of corners in one vector of samples: pixels of one quad lie side by side in memory.
-template <int LANES>
-constexpr int kColumns = LANES == kQuad ? 2 : 1;
+constexpr int columns_at_once(int lanes) { return lanes == kQuad ? 2 : 1; }
 
 // Weights as [tap][output][column][lane], zeros for the second column of a tap that has but one.
 template <class T>
 Buffer<T> pack_few(const Few& few, const Conv& conv, const Plan& plan, const View& weight) {
-  const int64_t columns = few.lanes == kQuad ? kColumns<kQuad> : 1;
+  const int columns = columns_at_once(few.lanes);
   const int64_t row = columns * few.lanes, step = few.outputs * row;
   Buffer<T> packed(plan.taps * step);
   std::fill_n(packed.get(), plan.taps * step, T(0));
@@ -74,7 +73,7 @@ class FewSums {
   using V = Vec<T, SAMPLE>;
 
   SURFCONV_INLINE void add(const V* samples, const FewTile<T>& few, int64_t t) {
-    constexpr int step = LANES * kColumns<LANES>;
+    constexpr int step = LANES * columns_at_once(LANES);
     const T* weight = few.weights + t * (OUTPUTS * step);
     // Else g++ moves the loads that both arms of a branch have in common before it, and spills.
     if (!__builtin_constant_p(t)) asm volatile("" : "+r"(weight));
@@ -163,7 +162,7 @@ SURFCONV_INLINE void few_walk(const FewTile<T>& few, const Run& run, const SideY
 
 template <int K, int LANES, int OUTPUTS, class T>
 void few_interior(FewTile<T> few, const Run& run) {
-  constexpr int SAMPLE = LANES * kColumns<LANES>;
+  constexpr int SAMPLE = LANES * columns_at_once(LANES);
   using W = Vec<T, SAMPLE>;
   const Axis axis_y = few.conv.y, axis_x = few.conv.x;
   const AxisTable<T> rows = few.tile.rows(), columns = few.tile.columns();

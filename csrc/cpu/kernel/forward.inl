@@ -121,8 +121,7 @@ class Forward {
     const int64_t unseen = byte_distance(base, unseen_.data());
     const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in};
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
-    scratch.tile.template place<false>(tensors_.scale, guide_.image(n), n, begin, count, steps_y,
-                                       steps_x);
+    scratch.tile.place(tensors_.scale, guide_.image(n), n, begin, count, steps_y, steps_x, false);
     // Straight into the output where whole blocks of the product fit there.
     const bool direct = writes_rows_ && (fused_ || few_ || count % kRowPad == 0);
     const int64_t ld_out = direct ? tensors_.output.x : plan_.groups * width_;

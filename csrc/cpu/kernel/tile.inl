@@ -46,10 +46,10 @@ class Tile {
     return false;
   }
 
-  // Flat output pixels first .. first+count-1 of image n.
-  template <bool Presence>
+  // Flat output pixels first .. first+count-1 of image n. Derivatives need to know what is inside
+  // the image, as the guide does.
   void place(const View& scale, const GuideImage<T>& guide, int64_t n, int64_t first, int count,
-             AxisSteps steps_y, AxisSteps steps_x) {
+             AxisSteps steps_y, AxisSteps steps_x, bool derivatives) {
     if (guide.value == nullptr) steps_y.pixel = steps_x.pixel = 0;
     T scale_y[kTile], scale_x_own[kTile];
     const auto load_scale = [&](int64_t component, T* to) {
@@ -72,13 +72,13 @@ class Tile {
       using Int = decltype(index);
       Int centre_y[kTile], centre_x[kTile];
       find_centres(first, count, centre_y, centre_x);
-      if (Presence || guide.value != nullptr) {
-        fill_axis<true>(conv_.y, steps_y, scale_y, centre_y, rows_, bounds);
-        fill_axis<true>(conv_.x, steps_x, scale_x, centre_x, columns_, bounds);
-      } else {
-        fill_axis<false>(conv_.y, steps_y, scale_y, centre_y, rows_, bounds);
-        fill_axis<false>(conv_.x, steps_x, scale_x, centre_x, columns_, bounds);
-      }
+      const auto fill_axes = [&](auto presence) {
+        constexpr bool Presence = decltype(presence)::value;
+        fill_axis<Presence>(conv_.y, steps_y, scale_y, centre_y, rows_, bounds);
+        fill_axis<Presence>(conv_.x, steps_x, scale_x, centre_x, columns_, bounds);
+      };
+      derivatives || guide.value != nullptr ? fill_axes(std::true_type{})
+                                            : fill_axes(std::false_type{});
     };
     if (sizeof(T) == 4 && narrow_) {
       fill(std::conditional_t<sizeof(T) == 4, int32_t, int64_t>{});

@@ -48,7 +48,7 @@ using One = std::integral_constant<int, 1>;
 using Two = std::integral_constant<int, 2>;
 
 // body(rows of corners, tap along y, number of its first tap) for the rows taps_y of the kernel. K:
-// the size of a square kernel that is walked whole, else 0: then loops are unrolled.
+// the size of a square kernel that is walked whole, whose loops are then unrolled, or 0.
 template <int K, class Body>
 SURFCONV_INLINE void walk_rows(const Axis& axis_y, const Axis& axis_x, Rows taps_y,
                                const Body& body) {
@@ -101,7 +101,7 @@ struct GridSide {
 template <int K, bool TWO, class T>
 SURFCONV_INLINE GridSide<T> grid_side(const Axis& axis, const AxisTable<T>& table, int64_t t,
                                       int m) {
-  // The side towards the centre holds the tap: see locate
+  // The side towards the centre holds the tap: see locate.
   const int64_t kernel = K > 0 ? K : axis.kernel, at = 2 * t * kTile + m;
   const int64_t near = TWO && t < kernel / 2 ? at + kTile : at, far = near == at ? at + kTile : at;
   if constexpr (!TWO) return {table.read[near], table.write[near], 0, true, T(0)};
