@@ -208,23 +208,14 @@ class Backward {
       });
     }
     if (tensors_.grad_weight.data == nullptr) return;
-    for (int64_t unit = 0; unit < units(); ++unit) {
-      const T* from = partials + weight_offset_[static_cast<size_t>(unit)];
-      for (const ChannelBlock& block : tile_.units()[static_cast<size_t>(unit)].blocks) {
-        store_block(block, from);
-        from += tile_.weight_elements(block);
-      }
-    }
-  }
-
-  void store_block(const ChannelBlock& block, const T* from) {
-    const View& to = tensors_.grad_weight;
-    visit_storage<T>(to, [&](auto* data) {
-      tile_.for_weights(block, [&](int64_t output, int64_t channel, int64_t tap, int64_t index) {
-        narrow(from[index], data + output * to.n + channel * to.c + tap / conv_.x.kernel * to.y +
-                                tap % conv_.x.kernel * to.x);
-      });
-    });
+    run_tasks(executor_, units(), workers_for(executor_, units(), weight_elements_),
+              [&](int, int64_t unit) {
+                const T* from = partials + weight_offset_[static_cast<size_t>(unit)];
+                for (const ChannelBlock& block : tile_.units()[static_cast<size_t>(unit)].blocks) {
+                  tile_.store_weights(block, from, tensors_.grad_weight);
+                  from += tile_.weight_elements(block);
+                }
+              });
   }
 
   const Conv& conv_;

@@ -58,29 +58,22 @@ class BackwardTile {
   }
   int64_t bias_elements() const { return conv_.out_channels; }
 
-  // Where the partial grad_weight of a block keeps each weight:
-  // body(output, channel of the group, tap, index)
-  template <class Body>
-  void for_weights(const ChannelBlock& block, const Body& body) const {
-    if (plan_.lanewise) {
-      for_lane_weights<false>(conv_, plan_, [&](int64_t o, int64_t c, int64_t k, int64_t lane) {
-        const int64_t at = lane - block.first;
-        if (at < 0 || at >= block.padded) return;
-        for (int64_t t = 0; t < plan_.taps; ++t) {
-          body(o, c, t, (t * plan_.weights_of_tap() + k) * block.padded + at);
-        }
-      });
+  // The sum of the partials of a block, where it belongs in the gradient of the weights.
+  void store_weights(const ChannelBlock& block, const T* from, const View& to) const {
+    if (plan_.lanewise) return store_lane_weights(block, from, to);
+    const int64_t first = block.group * plan_.outputs;
+    if (swapped_) {
+      for (int64_t o = 0; o < plan_.outputs; ++o) {
+        store_pixels<T>(to, first + o, block.first, block.count, conv_.x.kernel, 0, plan_.taps,
+                        from + o * weight_row(block), block.padded);
+      }
       return;
     }
-    for (int64_t t = 0; t < plan_.taps; ++t) {
-      for (int64_t c = 0; c < block.count; ++c) {
-        const int64_t column = t * block.padded + c;
-        for (int64_t o = 0; o < plan_.outputs; ++o) {
-          body(block.group * plan_.outputs + o, block.first + c, t,
-               swapped_ ? o * weight_row(block) + column : column * width_ + o);
-        }
-      }
-    }
+    const auto store_run = [&](const WeightRun& run) {
+      store_pixels<T>(run.view, 0, first, plan_.outputs, run.width, run.first, run.count,
+                      from + run.row * width_, run.step * width_);
+    };
+    for_weight_runs(to, conv_.x.kernel, block, 0, plan_.taps, block.padded, store_run);
   }
 
   void pack_weights(const Executor& executor) {
@@ -174,6 +167,20 @@ class BackwardTile {
 
   int64_t weight_row(const ChannelBlock& block) const {
     return plan_.taps * block.padded + 2 * kLanes<T>;
+  }
+
+  void store_lane_weights(const ChannelBlock& block, const T* from, const View& to) const {
+    visit_storage<T>(to, [&](auto* data) {
+      for_lane_weights<false>(conv_, plan_, [&](int64_t o, int64_t c, int64_t k, int64_t lane) {
+        const int64_t at = lane - block.first;
+        if (at < 0 || at >= block.padded) return;
+        auto* filter = data + o * to.n + c * to.c;
+        for (int64_t t = 0; t < plan_.taps; ++t) {
+          narrow(from[(t * plan_.weights_of_tap() + k) * block.padded + at],
+                 filter + t / conv_.x.kernel * to.y + t % conv_.x.kernel * to.x);
+        }
+      });
+    });
   }
 
   int64_t most_groups() const {

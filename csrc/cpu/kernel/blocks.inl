@@ -120,7 +120,41 @@ SURFCONV_INLINE int64_t taps_at_once(const Conv& conv, int64_t channels) {
   return std::min(rows, conv.y.kernel) * conv.x.kernel;
 }
 
-// Weights are packed by the loads of pixels: the kernel's taps are the pixels of a small image.
+// Weights are moved by the loads and stores of pixels, the kernel's taps being the pixels of a
+// small image, or, where the channels of a tap lie side by side, these.
+
+// Pixels first .. first+count-1 of a view, `width` of them in a row, that have a layer's outputs
+// for channels; of a block's rows (tap, channel) the first of theirs, and how far apart they are.
+struct WeightRun {
+  View view;
+  int64_t width, first, count;
+  int64_t row, step;
+};
+
+// body(run) for the weights of a block at `taps` taps.
+template <class Body>
+SURFCONV_INLINE void for_weight_runs(const View& weight, int64_t kernel_x,
+                                     const ChannelBlock& block, int64_t first_tap, int64_t taps,
+                                     int64_t rows_of_tap, const Body& body) {
+  View view = weight;
+  view.c = weight.n;
+  if (weight.c == 1) {
+    view.x = 1;
+    view.y = block.count;
+    for (int64_t t = 0; t < taps; ++t) {
+      const int64_t tap = first_tap + t;
+      View channels = view;
+      advance(channels, tap / kernel_x * weight.y + tap % kernel_x * weight.x + block.first);
+      body(WeightRun{channels, block.count, 0, block.count, t * rows_of_tap, 1});
+    }
+    return;
+  }
+  for (int64_t c = 0; c < block.count; ++c) {
+    View filter = view;
+    advance(filter, (block.first + c) * weight.c);
+    body(WeightRun{filter, kernel_x, first_tap, taps, c, rows_of_tap});
+  }
+}
 
 // Rows (tap, channel) of a block against its group's outputs, in panels: the forward's B.
 template <class T>
@@ -129,13 +163,11 @@ void pack_forward(const View& weight, int64_t kernel_x, const Plan& plan, const 
   for_panels<T>(plan.outputs, [&](int64_t column, int64_t columns) {
     T* panel = packed + column * taps * block.count;
     const int64_t used = std::min(columns, plan.outputs - column);
-    for (int64_t c = 0; c < block.count; ++c) {
-      View filter = weight;
-      advance(filter, (block.first + c) * weight.c);
-      filter.c = weight.n;
-      load_pixels<T>(filter, 0, block.group * plan.outputs + column, used, kernel_x, first_tap,
-                     taps, panel + c * columns, block.count * columns, columns);
-    }
+    const auto load_run = [&](const WeightRun& run) {
+      load_pixels<T>(run.view, 0, block.group * plan.outputs + column, used, run.width, run.first,
+                     run.count, panel + run.row * columns, run.step * columns, columns);
+    };
+    for_weight_runs(weight, kernel_x, block, first_tap, taps, block.count, load_run);
   });
 }
 
