@@ -130,8 +130,11 @@ class Forward {
                     : scratch.out;
     const int64_t group_step = direct ? plan_.outputs : width_;
     const auto fetch_ahead = [&](int64_t channel, int64_t channels) SURFCONV_INLINED {
-      prefetch_ahead(conv_, scratch.tile, count,
-                     {base + channel * bytes, steps_y.read, steps_x.read, channels * bytes});
+      if (conv_.y.kernel == 1) return;
+      const ImagePart part{base + channel * bytes, steps_y.read, steps_x.read, channels * bytes};
+      const FetchAhead fetch(conv_.y, conv_.x, part);
+      fetch(scratch.tile.rows().read + (conv_.y.kernel * 2 - 1) * kTile,
+            scratch.tile.columns().read + conv_.x.kernel / 2 * 2 * kTile, count);
     };
     if (fused_) {
       fetch_ahead(0, plan_.row);

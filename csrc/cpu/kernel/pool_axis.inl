@@ -5,17 +5,19 @@ enum class Edges { zero, clamp };  // what samples outside the image are: an ave
 template <class T>
 struct PoolAxis {
   T* weight;
-  T* slope;        // of the weight, by the scale; also where the weight is 0 on a pixel
-  int64_t* pixel;  // inside the image, whatever the weight
+  T* slope;         // of the weight, by the scale; also where the weight is 0 on a pixel
+  int64_t* pixel;   // inside the image, whatever the weight
+  int64_t* offset;  // of the pixel, in elements
 
   static int64_t entries(const Axis& axis) { return axis.kernel * 2 * kTile; }
   static int64_t need(const Axis& axis) {
-    return 2 * Workspace::need<T>(entries(axis)) + Workspace::need<int64_t>(entries(axis));
+    return 2 * Workspace::need<T>(entries(axis)) + 2 * Workspace::need<int64_t>(entries(axis));
   }
   void take(const Axis& axis, Workspace& memory) {
     weight = memory.take<T>(entries(axis));
     slope = memory.take<T>(entries(axis));
     pixel = memory.take<int64_t>(entries(axis));
+    offset = memory.take<int64_t>(entries(axis));
   }
 };
 
@@ -92,9 +94,10 @@ void locate_pool(const Axis& axis, T half, T tap, const T* __restrict scale,
   }
 }
 
+// step: of offsets
 template <Edges E, class T, class Int>
-void fill_pool_axis(const Axis& axis, const T* __restrict scale, const Int* __restrict centre,
-                    const PoolAxis<T>& table, PoolBounds<T>& bounds) {
+void fill_pool_axis(const Axis& axis, int64_t step, const T* __restrict scale,
+                    const Int* __restrict centre, const PoolAxis<T>& table, PoolBounds<T>& bounds) {
   const T half = axis.centre_is_half() ? T(0.5) : T(0);
   const Int last = static_cast<Int>(axis.in - 1);
   for (int64_t t = 0; t < axis.kernel; ++t) {
@@ -117,5 +120,7 @@ void fill_pool_axis(const Axis& axis, const T* __restrict scale, const Int* __re
     } else {
       locate_pool<E, false>(axis, half, tap, scale, centre, weight, slope, pixel, bounds);
     }
+    int64_t* __restrict offset = table.offset + t * 2 * kTile;
+    for (int i = 0; i < 2 * kTile; ++i) offset[i] = pixel[i] * step;
   }
 }

@@ -69,6 +69,7 @@ void pool_grad_input(const Pool& pool, const PoolBackwardTensors& tensors, const
                        grads, padded, padded);
         for (int64_t m = 0; m < pixels; ++m) {
           sampler.list(m);
+          sampler.fetch_ahead(m, image, channels);
           body(sampler, numbers, m, n * outputs + first + m, first_channel, channels,
                grads + m * padded, image);
         }
@@ -112,10 +113,11 @@ void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const
                          padded, padded);
           T along_y[kTile], along_x[kTile];
           for (int64_t m = 0; m < pixels; ++m) {
+            const T* image = images.image(n);
             sampler.list(m);
-            const ScaleGradient<T> grad =
-                body(sampler, numbers[static_cast<size_t>(worker)], images.image(n), m,
-                     n * outputs + first + m, grads + m * padded);
+            sampler.fetch_ahead(m, image, pool.channels);
+            const ScaleGradient<T> grad = body(sampler, numbers[static_cast<size_t>(worker)], image,
+                                               m, n * outputs + first + m, grads + m * padded);
             along_y[m] = grad.y;
             along_x[m] = grad.x;
           }
@@ -176,7 +178,7 @@ void avg_pool_backward_of(const Pool& pool, const PoolBackwardTensors& tensors,
   if (tensors.grad_input.data != nullptr) {
     pool_grad_input<Edges::zero, T>(pool, tensors, executor,
                                     [&](const auto& sampler, const auto&, int64_t m, int64_t,
-                                        int64_t, int64_t channels, T* grad, T* image) {
+                                        int64_t, int64_t channels, const T* grad, T* image) {
                                       scatter_average(sampler.corners, sampler.divisor(m),
                                                       to_quads(channels), grad, image);
                                     });

@@ -19,6 +19,50 @@ struct PoolCorners {
   bool has_tap(int64_t t) const { return sees(t) || (hidden != nullptr && hidden[t]); }
 };
 
+// body(corners as a constant, tap, place of its first in the arrays) for the taps of which
+// something is seen.
+template <class T, class Body>
+SURFCONV_INLINE void for_seen_taps(const PoolCorners<T>& corners, int64_t taps, const Body& body) {
+  for (int64_t t = 0; t < taps; ++t) {
+    const int64_t at = corners.first[t] * corners.step;
+    switch (corners.first[t + 1] - corners.first[t]) {
+      case 0:
+        break;
+      case 1:
+        body(std::integral_constant<int, 1>{}, t, at);
+        break;
+      case 2:
+        body(std::integral_constant<int, 2>{}, t, at);
+        break;
+      case 3:
+        body(std::integral_constant<int, 3>{}, t, at);
+        break;
+      default:
+        body(std::integral_constant<int, 4>{}, t, at);
+    }
+  }
+}
+
+// Channels, a multiple of kQuad, in strips of up to four vectors, which share what is read of a
+// corner and need not wait for each other: body(first channel, strip)
+template <int Lanes, int Vectors>
+struct Strip {
+  static constexpr int lanes = Lanes, vectors = Vectors;
+};
+template <class T, class Body>
+SURFCONV_INLINE void for_strips(int64_t channels, const Body& body) {
+  constexpr int lanes = kLanes<T>;
+  int64_t c = 0;
+  for (; c + 4 * lanes <= channels; c += 4 * lanes) body(c, Strip<lanes, 4>{});
+  if (c + 2 * lanes <= channels) {
+    body(c, Strip<lanes, 2>{});
+    c += 2 * lanes;
+  }
+  for_channels<T>(channels - c, [&](int64_t rest, auto width) SURFCONV_INLINED {
+    body(c + rest, Strip<decltype(width)::lanes, 1>{});
+  });
+}
+
 // Memory of corners, [entry][pixel].
 template <class T>
 struct CornerMemory {
@@ -72,15 +116,14 @@ class CornerPattern {
   }
 
   template <Slopes S>
-  void fill(const Pool& pool, const PoolAxis<T>& rows, const PoolAxis<T>& columns, int64_t step_y,
-            int64_t step_x) {
+  void fill(const Pool& pool, const PoolAxis<T>& rows, const PoolAxis<T>& columns) {
     int64_t* offset = memory_.offset;
     T *weight = memory_.weight, *slope = memory_.slope, *slope_x = memory_.slope_x;
     for_entries(pool, cell_, [&](int64_t, int64_t row, int64_t column) {
-      const int64_t *y = rows.pixel + row * kTile, *x = columns.pixel + column * kTile;
+      const int64_t *y = rows.offset + row * kTile, *x = columns.offset + column * kTile;
       const T *weight_y = rows.weight + row * kTile, *weight_x = columns.weight + column * kTile;
       const T *by_y = rows.slope + row * kTile, *by_x = columns.slope + column * kTile;
-      for (int m = 0; m < kTile; ++m) offset[m] = y[m] * step_y + x[m] * step_x;
+      for (int m = 0; m < kTile; ++m) offset[m] = y[m] + x[m];
       for (int m = 0; m < kTile; ++m) weight[m] = weight_y[m] * weight_x[m];
       if constexpr (S != Slopes::none) {
         for (int m = 0; m < kTile; ++m) {

@@ -67,7 +67,6 @@ void max_of_pixel(const T* image, const PoolCorners<T>& corners, int64_t taps, i
   }
 }
 
-// Several vectors at once, so that a sum need not wait for the one before it.
 template <int Lanes, int Vectors, class T>
 SURFCONV_INLINE void sum_of_corners(const T* image, const PoolCorners<T>& corners, T divisor,
                                     T* out) {
@@ -86,13 +85,9 @@ SURFCONV_INLINE void sum_of_corners(const T* image, const PoolCorners<T>& corner
 template <class T>
 void average_of_pixel(const T* image, const PoolCorners<T>& corners, T divisor, int64_t channels,
                       T* out) {
-  constexpr int lanes = kLanes<T>;
-  int64_t c = 0;
-  for (; c + 4 * lanes <= channels; c += 4 * lanes) {
-    sum_of_corners<lanes, 4>(image + c, corners, divisor, out + c);
-  }
-  for_channels<T>(channels - c, [&](int64_t rest, auto width) {
-    sum_of_corners<decltype(width)::lanes, 1>(image + c + rest, corners, divisor, out + c + rest);
+  for_strips<T>(channels, [&](int64_t c, auto strip) SURFCONV_INLINED {
+    using S = decltype(strip);
+    sum_of_corners<S::lanes, S::vectors>(image + c, corners, divisor, out + c);
   });
 }
 
@@ -128,8 +123,10 @@ void pool_forward(const Pool& pool, const PoolForwardTensors& tensors, const Exe
             T* to = direct
                         ? static_cast<T*>(output.data) + n * output.n + y * output.y + x * output.x
                         : stage + m * padded;
+            const T* image = images.image(n);
             sampler.list(m);
-            body(sampler, images.image(n), m, n * outputs + first + m, to);
+            sampler.fetch_ahead(m, image, pool.channels);
+            body(sampler, image, m, n * outputs + first + m, to);
           }
           if (!direct) {
             store_pixels<T>(output, n, 0, pool.channels, pool.x.out, first, pixels, stage, padded);

@@ -16,56 +16,74 @@ SURFCONV_INLINE V masked(M mask, V value) {
   return (V)((M)value & mask);
 }
 
-// Calls body(channel, width, tap, which lanes it has won) for all channels and taps: which tap has
-// won a channel is random, and so would be branches on it.
-template <class T, class W, class Body>
-SURFCONV_INLINE void for_winners(const PoolCorners<T>& corners, int64_t taps, int64_t channels,
-                                 const W* winners, const Body& body) {
+// Which tap has won each channel of a strip. It is random, and so would be branches on it.
+template <class T, class Strip>
+struct WinnersOf {
   using Number = std::conditional_t<sizeof(T) == 8, int64_t, int32_t>;
-  const auto visit = [&](int64_t c, auto width) SURFCONV_INLINED {
-    constexpr int lanes = decltype(width)::lanes;
-    using Numbers = Vec<Number, lanes>;
-    const auto winner = __builtin_convertvector(load<Vec<W, lanes>>(winners + c), Numbers);
-    for (int64_t t = 0; t < taps; ++t) {
-      if (!corners.sees(t)) continue;
-      body(c, width, t, equal_lanes(winner, Numbers{} + static_cast<Number>(t)));
+  using Numbers = Vec<Number, Strip::lanes>;
+  Numbers winner[Strip::vectors];
+
+  template <class W>
+  explicit SURFCONV_INLINE WinnersOf(const W* from) {
+#pragma GCC unroll 4
+    for (int i = 0; i < Strip::vectors; ++i) {
+      winner[i] =
+          __builtin_convertvector(load<Vec<W, Strip::lanes>>(from + i * Strip::lanes), Numbers);
     }
-  };
-  for_channels<T>(channels, visit);
+  }
+  // Lanes of -1 in vector i where tap t has won.
+  SURFCONV_INLINE Numbers operator()(int i, int64_t t) const {
+    return equal_lanes(winner[i], Numbers{} + static_cast<Number>(t));
+  }
+};
+
+// to += weight * share
+template <class Strip, class T, class V>
+SURFCONV_INLINE void add_strip(Strip, T weight, const V (&share)[Strip::vectors], T* to) {
+#pragma GCC unroll 4
+  for (int i = 0; i < Strip::vectors; ++i) {
+    T* place = to + i * Strip::lanes;
+    store(place, V(load<V>(place) + weight * share[i]));
+  }
 }
 
 // winners and grad: whole quads of channels.
 template <class T, class W>
 SURFCONV_INLINE void scatter_winners(const PoolCorners<T>& corners, int64_t taps, int64_t channels,
                                      const T* grad, const W* winners, T* to) {
-  for_winners(corners, taps, channels, winners,
-              [&](int64_t c, auto width, int64_t t, auto won) SURFCONV_INLINED {
-                using V = Vec<T, decltype(width)::lanes>;
-                const V share = masked(won, load<V>(grad + c));
-                for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
-                  T* pixel = to + corners.offset[q * corners.step] + c;
-                  store(pixel, V(load<V>(pixel) + corners.weight[q * corners.step] * share));
-                }
-              });
+  for_strips<T>(channels, [&](int64_t c, auto strip) SURFCONV_INLINED {
+    using S = decltype(strip);
+    using V = Vec<T, S::lanes>;
+    const WinnersOf<T, S> won(winners + c);
+    for_seen_taps(corners, taps, [&](auto count, int64_t t, int64_t at) SURFCONV_INLINED {
+      V share[S::vectors];
+#pragma GCC unroll 4
+      for (int i = 0; i < S::vectors; ++i) {
+        share[i] = masked(won(i, t), load<V>(grad + c + i * S::lanes));
+      }
+#pragma GCC unroll 4
+      for (int q = 0; q < decltype(count)::value; ++q, at += corners.step) {
+        add_strip(strip, corners.weight[at], share, to + corners.offset[at] + c);
+      }
+    });
+  });
 }
 
-// grad is changed: it becomes the gradient of the sum.
 template <class T>
 SURFCONV_INLINE void scatter_average(const PoolCorners<T>& corners, T divisor, int64_t channels,
-                                     T* grad, T* to) {
+                                     const T* grad, T* to) {
   if (divisor == 0) return;
-  for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-    using V = Vec<T, decltype(width)::lanes>;
-    store(grad + c, V(load<V>(grad + c) / divisor));
+  for_strips<T>(channels, [&](int64_t c, auto strip) SURFCONV_INLINED {
+    using S = decltype(strip);
+    using V = Vec<T, S::lanes>;
+    V share[S::vectors];
+#pragma GCC unroll 4
+    for (int i = 0; i < S::vectors; ++i) share[i] = load<V>(grad + c + i * S::lanes) / divisor;
+    for (int64_t q = 0; q < corners.count; ++q) {
+      const int64_t at = q * corners.step;
+      add_strip(strip, corners.weight[at], share, to + corners.offset[at] + c);
+    }
   });
-  for (int64_t q = 0; q < corners.count; ++q) {
-    T* pixel = to + corners.offset[q * corners.step];
-    const T weight = corners.weight[q * corners.step];
-    for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-      using V = Vec<T, decltype(width)::lanes>;
-      store(pixel + c, V(load<V>(pixel + c) + weight * load<V>(grad + c)));
-    });
-  }
 }
 
 template <class T>
@@ -73,82 +91,111 @@ struct ScaleGradient {
   T y = 0, x = 0;  // by the scale, or by its two components
 };
 
-template <Slopes S, class T, class W>
+// Sums of a strip's lanes, added up over the strips of a pixel.
+template <class T>
+class LaneSums {
+ public:
+  template <class V, int N>
+  SURFCONV_INLINE void add(const V (&parts)[N]) {
+    V sum = parts[0];
+#pragma GCC unroll 4
+    for (int i = 1; i < N; ++i) sum += parts[i];
+    if constexpr (sizeof(V) == sizeof(whole_)) {
+      whole_ += sum;
+    } else {
+      tail_ += sum_lanes<T>(sum);
+    }
+  }
+  T total() const { return sum_lanes<T>(whole_) + tail_; }
+
+ private:
+  Vec<T, kLanes<T>> whole_{};
+  T tail_ = 0;
+};
+
+template <Slopes Of, class T, class W>
 ScaleGradient<T> slopes_of_winners(const PoolCorners<T>& corners, int64_t taps, int64_t channels,
                                    const T* grad, const W* winners, const T* image) {
-  constexpr int most = kLanes<T>;
-  Vec<T, most> sum_y{}, sum_x{};
-  T tail_y = 0, tail_x = 0;
-  for_winners(corners, taps, channels, winners,
-              [&](int64_t c, auto width, int64_t t, auto won) SURFCONV_INLINED {
-                constexpr int lanes = decltype(width)::lanes;
-                using V = Vec<T, lanes>;
-                V slope{}, slope_x{};
-                for (int32_t q = corners.first[t]; q < corners.first[t + 1]; ++q) {
-                  const int64_t at = q * corners.step;
-                  const V value = load<V>(image + corners.offset[at] + c);
-                  slope += corners.slope[at] * value;
-                  if constexpr (S == Slopes::two) slope_x += corners.slope_x[at] * value;
-                }
-                const V outer = load<V>(grad + c);
-                slope = masked(won, V(slope * outer));
-                if constexpr (S == Slopes::two) slope_x = masked(won, V(slope_x * outer));
-                if constexpr (lanes == most) {
-                  sum_y += slope;
-                  sum_x += slope_x;
-                } else {
-                  tail_y += sum_lanes<T>(slope);
-                  tail_x += sum_lanes<T>(slope_x);
-                }
-              });
-  return {sum_lanes<T>(sum_y) + tail_y, sum_lanes<T>(sum_x) + tail_x};
+  LaneSums<T> sum, sum_x;
+  for_strips<T>(channels, [&](int64_t c, auto strip) SURFCONV_INLINED {
+    using S = decltype(strip);
+    using V = Vec<T, S::lanes>;
+    const WinnersOf<T, S> won(winners + c);
+    V along[S::vectors] = {}, along_x[S::vectors] = {};
+    for_seen_taps(corners, taps, [&](auto count, int64_t t, int64_t at) SURFCONV_INLINED {
+      V slope[S::vectors] = {}, slope_x[S::vectors] = {};
+#pragma GCC unroll 4
+      for (int q = 0; q < decltype(count)::value; ++q, at += corners.step) {
+        const T* pixel = image + corners.offset[at] + c;
+#pragma GCC unroll 4
+        for (int i = 0; i < S::vectors; ++i) {
+          const V value = load<V>(pixel + i * S::lanes);
+          slope[i] += corners.slope[at] * value;
+          if constexpr (Of == Slopes::two) slope_x[i] += corners.slope_x[at] * value;
+        }
+      }
+#pragma GCC unroll 4
+      for (int i = 0; i < S::vectors; ++i) {
+        const V outer = load<V>(grad + c + i * S::lanes);
+        along[i] += masked(won(i, t), V(slope[i] * outer));
+        if constexpr (Of == Slopes::two) along_x[i] += masked(won(i, t), V(slope_x[i] * outer));
+      }
+    });
+    sum.add(along);
+    if constexpr (Of == Slopes::two) sum_x.add(along_x);
+  });
+  return {sum.total(), sum_x.total()};
 }
 
 // weighted: the weights make up the divisor, and what they gain takes from each corner its share.
-template <Slopes S, class T>
+template <Slopes Of, class T>
 ScaleGradient<T> slopes_of_average(const PoolCorners<T>& corners, bool weighted, T divisor,
                                    int64_t channels, const T* grad, const T* image) {
   if (divisor == 0) return {};
+  const bool gains = weighted && corners.moves_total;
   double gain = 0, gain_x = 0;
-  if (weighted && corners.moves_total) {
+  if (gains) {
     gain = static_cast<double>(corners.hidden_slope);
     gain_x = static_cast<double>(corners.hidden_slope_x);
     for (int64_t q = 0; q < corners.count; ++q) {
       gain += static_cast<double>(corners.slope[q * corners.step]);
-      if (S == Slopes::two) gain_x += static_cast<double>(corners.slope_x[q * corners.step]);
+      if (Of == Slopes::two) gain_x += static_cast<double>(corners.slope_x[q * corners.step]);
     }
     gain /= static_cast<double>(divisor);
     gain_x /= static_cast<double>(divisor);
   }
-  Vec<T, kLanes<T>> sum_y{}, sum_x{};
-  T tail_y = 0, tail_x = 0;
-  for_channels<T>(channels, [&](int64_t c, auto width) SURFCONV_INLINED {
-    constexpr int lanes = decltype(width)::lanes;
-    using V = Vec<T, lanes>;
-    V along{}, along_x{};
+  const auto less = [&](T slope, T weight, double by) SURFCONV_INLINED {
+    if (!gains) return slope;
+    return static_cast<T>(static_cast<double>(slope) - static_cast<double>(weight) * by);
+  };
+  LaneSums<T> sum, sum_x;
+  for_strips<T>(channels, [&](int64_t c, auto strip) SURFCONV_INLINED {
+    using S = decltype(strip);
+    using V = Vec<T, S::lanes>;
+    V along[S::vectors] = {}, along_x[S::vectors] = {};
     for (int64_t q = 0; q < corners.count; ++q) {
       const int64_t at = q * corners.step;
-      const double weight = static_cast<double>(corners.weight[at]);
-      const T slope = static_cast<T>(static_cast<double>(corners.slope[at]) - weight * gain);
-      T slope_x = 0;
-      if constexpr (S == Slopes::two) {
-        slope_x = static_cast<T>(static_cast<double>(corners.slope_x[at]) - weight * gain_x);
-      }
+      const T slope = less(corners.slope[at], corners.weight[at], gain);
+      const T slope_x =
+          Of == Slopes::two ? less(corners.slope_x[at], corners.weight[at], gain_x) : T(0);
       // What is not finite concerns nothing that does not move.
       if (slope == 0 && slope_x == 0) continue;
-      const V value = load<V>(image + corners.offset[at] + c);
-      along += slope * value;
-      if constexpr (S == Slopes::two) along_x += slope_x * value;
+      const T* pixel = image + corners.offset[at] + c;
+#pragma GCC unroll 4
+      for (int i = 0; i < S::vectors; ++i) {
+        const V value = load<V>(pixel + i * S::lanes);
+        along[i] += slope * value;
+        if constexpr (Of == Slopes::two) along_x[i] += slope_x * value;
+      }
     }
-    along *= load<V>(grad + c);
-    if constexpr (S == Slopes::two) along_x *= load<V>(grad + c);
-    if constexpr (lanes == kLanes<T>) {
-      sum_y += along;
-      sum_x += along_x;
-    } else {
-      tail_y += sum_lanes<T>(along);
-      tail_x += sum_lanes<T>(along_x);
+#pragma GCC unroll 4
+    for (int i = 0; i < S::vectors; ++i) {
+      const V outer = load<V>(grad + c + i * S::lanes);
+      along[i] *= outer;
+      along_x[i] *= outer;
     }
+    sum.add(along);
+    if constexpr (Of == Slopes::two) sum_x.add(along_x);
   });
-  return {(sum_lanes<T>(sum_y) + tail_y) / divisor, (sum_lanes<T>(sum_x) + tail_x) / divisor};
+  return {sum.total() / divisor, sum_x.total() / divisor};
 }

@@ -57,8 +57,8 @@ class PoolSampler {
       any_whole |= is_whole(m);
       any_on_grid |= is_on_grid(m);
     }
-    if (any_whole) whole_.template fill<S>(pool_, rows_, columns_, step_y_, step_x_);
-    if (any_on_grid) on_grid_.template fill<S>(pool_, rows_, columns_, step_y_, step_x_);
+    if (any_whole) whole_.template fill<S>(pool_, rows_, columns_);
+    if (any_on_grid) on_grid_.template fill<S>(pool_, rows_, columns_);
   }
 
   // Sets `corners` to those of pixel m of the tile.
@@ -78,6 +78,16 @@ class PoolSampler {
     if (!(std::fabs(centre) <= std::numeric_limits<T>::max())) return list_seen<false>(m);
     centre_ = centre;
     list_seen<true>(m);
+  }
+
+  // Fetches what pixels to come will meet of the image whose corners are listed, where it starts.
+  void fetch_ahead(int64_t m, const T* image, int64_t channels) const {
+    constexpr int64_t bytes = sizeof(T);
+    const int64_t row = rows_.offset[(pool_.y.kernel * 2 - 1) * kTile + m];
+    const int64_t column = columns_.offset[pool_.x.kernel / 2 * 2 * kTile + m];
+    const ImagePart part{reinterpret_cast<const char*>(image), step_y_ * bytes, step_x_ * bytes,
+                         channels * bytes};
+    FetchAhead(pool_.y, pool_.x, part)((row + column) * bytes);
   }
 
   // An average's divisor at pixel m, whose corners are listed.
@@ -110,8 +120,8 @@ class PoolSampler {
       row[m] = static_cast<Int>(pool_.y.centre_floor(oy_[m]));
       column[m] = static_cast<Int>(pool_.x.centre_floor(ox_[m]));
     }
-    fill_pool_axis<E>(pool_.y, scale_y, row, rows_, bounds_);
-    fill_pool_axis<E>(pool_.x, scale_x, column, columns_, bounds_);
+    fill_pool_axis<E>(pool_.y, step_y_, scale_y, row, rows_, bounds_);
+    fill_pool_axis<E>(pool_.x, step_x_, scale_x, column, columns_, bounds_);
   }
 
   template <bool Guided>
@@ -130,8 +140,7 @@ class PoolSampler {
           const int64_t at_y = (ty * 2 + side / 2) * kTile + m;
           const int64_t at_x = (tx * 2 + side % 2) * kTile + m;
           const T weight = rows_.weight[at_y] * columns_.weight[at_x];
-          const int64_t row = rows_.pixel[at_y], column = columns_.pixel[at_x];
-          to.offset[n] = row * step_y_ + column * step_x_;
+          to.offset[n] = rows_.offset[at_y] + columns_.offset[at_x];
           to.weight[n] = weight;
           bool kept = weight != 0;
           if constexpr (kSloped) {
@@ -143,7 +152,8 @@ class PoolSampler {
           }
           total += weight;
           if constexpr (Guided) {
-            if (kept && !(std::fabs(guide_[row * pool_.x.in + column] - centre_) <= tolerance)) {
+            const T value = guide_[rows_.pixel[at_y] * pool_.x.in + columns_.pixel[at_x]];
+            if (kept && !(std::fabs(value - centre_) <= tolerance)) {
               kept = false;
               hides |= weight != 0;
               if constexpr (kSloped) hidden_slope += to.slope[n], hidden_slope_x += to.slope_x[n];

@@ -19,22 +19,36 @@ struct ImagePart {
   int64_t bytes;           // of a pixel's channels
 };
 
-template <class T>
-SURFCONV_INLINE void prefetch_ahead(const Conv& conv, const Tile<T>& tile, int count,
-                                    const ImagePart& part) {
-  constexpr int64_t kTilesAhead = 2, kLine = 64;
-  if (conv.y.kernel == 1) return;
-  const int64_t* lowest = tile.rows().read + (conv.y.kernel * 2 - 1) * kTile;
-  const int64_t* middle = tile.columns().read + conv.x.kernel / 2 * 2 * kTile;
-  const int64_t advance = conv.x.stride * part.step_x, ahead = kTilesAhead * kTile * advance;
-  const int64_t bytes = part.bytes + advance - part.step_x;
-  const int pixels = static_cast<int>(std::max<int64_t>(1, kLine / advance));
-  for (int m = 0; m < count; m += pixels) {
-    const uintptr_t pixel = reinterpret_cast<uintptr_t>(part.first_pixel) +
-                            static_cast<uintptr_t>(lowest[m] + middle[m] + ahead);
-    for (int64_t y = 0; y < conv.y.stride; ++y) {
-      const uintptr_t row = pixel - static_cast<uintptr_t>(y * part.step_y);
-      for (int64_t at = 0; at < bytes; at += kLine) prefetch(row + static_cast<uintptr_t>(at));
+class FetchAhead {
+ public:
+  FetchAhead(const Axis& y, const Axis& x, const ImagePart& part)
+      : rows_(std::min(y.stride, y.kernel)),
+        bytes_(part.bytes + (std::min(x.stride, x.kernel) - 1) * part.step_x),
+        step_y_(static_cast<uintptr_t>(part.step_y)),
+        advance_(x.stride * part.step_x),
+        start_(reinterpret_cast<uintptr_t>(part.first_pixel) +
+               static_cast<uintptr_t>(kPixelsAhead * advance_)) {}
+
+  // lowest: where an output pixel's lowest taps are, bytes from the first pixel.
+  SURFCONV_INLINE void operator()(int64_t lowest) const {
+    uintptr_t row = start_ + static_cast<uintptr_t>(lowest);
+    for (int64_t i = 0; i < rows_; ++i, row -= step_y_) {
+      for (int64_t at = 0; at < bytes_; at += kLine) prefetch(row + static_cast<uintptr_t>(at));
     }
   }
-}
+
+  // For the pixels of a tile: lowest and middle, where the rows and columns of those taps are.
+  SURFCONV_INLINE void operator()(const int64_t* lowest, const int64_t* middle, int count) const {
+    const int pixels = static_cast<int>(std::max<int64_t>(1, kLine / advance_));
+    for (int m = 0; m < count; m += pixels) (*this)(lowest[m] + middle[m]);
+  }
+
+ private:
+  static constexpr int64_t kPixelsAhead = 2 * kTile, kLine = 64;
+
+  // The pixels that the window moves on by, as far as it covers them.
+  const int64_t rows_, bytes_;
+  const uintptr_t step_y_;
+  const int64_t advance_;
+  const uintptr_t start_;
+};

@@ -5,6 +5,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "workspace.inl"
 #include "pixels.inl"
 #include "axis.inl"
+#include "prefetch.inl"
 #include "pool_axis.inl"
 #include "pool_corners.inl"
 #include "pool_samples.inl"
