@@ -76,6 +76,35 @@ def test_strided_arguments(layout: str, case: str) -> None:
     problem.check_gradients(surf_conv2d)
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16], ids=str)
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize(
+    ("channels", "outputs", "groups", "kernel"),
+    [
+        (70, 37, 1, 3),  # two blocks of channels, panels of every width, tails of both
+        (13, 3, 1, 3),  # few outputs
+        (18, 36, 2, 3),  # a block for each group
+        (9, 18, 9, 3),  # two outputs of each channel
+        (5, 21, 1, (9, 31)),  # rows of taps one after the other
+        (1, 20, 1, 2),
+    ],
+)
+def test_weights_of_any_layout(
+    channels: int,
+    outputs: int,
+    groups: int,
+    kernel: int | tuple[int, int],
+    layout: str,
+    dtype: torch.dtype,
+) -> None:
+    problem = make_problem(
+        1, channels, outputs, (5, 6), kernel, padding=(4, 15), groups=groups, dtype=dtype
+    )
+    problem = replace(problem, weight=lay_out(problem.weight, layout))
+    problem.check_forward(surf_conv2d)
+    problem.check_gradients(surf_conv2d)
+
+
 @pytest.mark.parametrize("layout", ["sliced", "transposed"])
 def test_strided_bias_and_guide(layout: str) -> None:
     problem = make_problem(guide="levels")
