@@ -1,7 +1,7 @@
-// The pixels that tiles to come will meet first, fetched while a product is busy: the processor's
-// own prefetching stops at the gaps between tiles. Neighbours are at like depths, so these are
-// where the lowest taps of this tile are, some tiles further on. (The backward gained nothing by
-// it.)
+// The pixels that windows to come will meet first: the processor's own prefetching stops at the
+// gaps between tiles, and loses its way among the rows of a pool's window. Neighbours are at like
+// depths, so these are where the lowest taps are now, some tiles further on. (The convolution's
+// backward gained nothing by it.)
 
 SURFCONV_INLINE void prefetch(uintptr_t place) {
 #if defined(SURFCONV_X86)
