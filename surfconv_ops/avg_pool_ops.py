@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import pool_reference
+from . import direct, pool_reference
 from .geometry import Pair
 from .pool_ops import (
     Grads,
@@ -35,6 +35,19 @@ def save_forward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     ctx.options = options
 
 
+def surf_avg_pool2d(*arguments: Any) -> Tensor:
+    """The operator on checked arguments."""
+    output: Tensor = direct.apply(SurfAvgPool2dFunction, _op, *arguments)
+    return output
+
+
+def _call_backward(*arguments: Any) -> tuple[Tensor, Tensor]:
+    grads: tuple[Tensor, Tensor] = direct.apply(
+        SurfAvgPool2dBackwardFunction, _backward_op, *arguments
+    )
+    return grads
+
+
 # Arguments one by one: TorchDynamo 2.13 hands its context to a forward that takes ``*args``.
 class SurfAvgPool2dFunction(torch.autograd.Function):
     """The average; its backward is :class:`SurfAvgPool2dBackwardFunction`."""
@@ -51,7 +64,8 @@ class SurfAvgPool2dFunction(torch.autograd.Function):
         count_include_pad: bool,
         divisor_override: int,
     ) -> Tensor:
-        output: Tensor = _op(
+        output: Tensor = direct.run_kernel(
+            _op,
             input,
             scale,
             guide,
@@ -70,7 +84,7 @@ class SurfAvgPool2dFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad_output: Tensor) -> Grads:
-        return differentiate(SurfAvgPool2dBackwardFunction.apply, ctx, grad_output)
+        return differentiate(_call_backward, ctx, grad_output)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
@@ -95,7 +109,8 @@ class SurfAvgPool2dBackwardFunction(torch.autograd.Function):
         need_input: bool,
         need_scale: bool,
     ) -> tuple[Tensor, Tensor]:
-        grads: tuple[Tensor, Tensor] = _backward_op(
+        grads: tuple[Tensor, Tensor] = direct.run_kernel(
+            _backward_op,
             grad_output,
             input,
             scale,

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from . import pool_reference
+from . import direct, pool_reference
 from .geometry import Pair
 from .pool_ops import (
     Grads,
@@ -41,6 +41,19 @@ def save_forward(ctx: Any, inputs: tuple[Any, ...], output: Any) -> None:
     ctx.options = options
 
 
+def surf_max_pool2d(*arguments: Any) -> tuple[Tensor, Tensor]:
+    """The operator on checked arguments: the maximum and its winners."""
+    result: tuple[Tensor, Tensor] = direct.apply(SurfMaxPool2dFunction, _op, *arguments)
+    return result
+
+
+def _call_backward(*arguments: Any) -> tuple[Tensor, Tensor]:
+    grads: tuple[Tensor, Tensor] = direct.apply(
+        SurfMaxPool2dBackwardFunction, _backward_op, *arguments
+    )
+    return grads
+
+
 # Arguments one by one: TorchDynamo 2.13 hands its context to a forward that takes ``*args``.
 class SurfMaxPool2dFunction(torch.autograd.Function):
     """The maximum and its winners; its backward is :class:`SurfMaxPool2dBackwardFunction`."""
@@ -56,7 +69,8 @@ class SurfMaxPool2dFunction(torch.autograd.Function):
         padding: Pair,
         dilation: Pair,
     ) -> tuple[Tensor, Tensor]:
-        result: tuple[Tensor, Tensor] = _op(
+        result: tuple[Tensor, Tensor] = direct.run_kernel(
+            _op,
             input,
             scale,
             guide,
@@ -74,7 +88,7 @@ class SurfMaxPool2dFunction(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, grad_output: Tensor, _: Any) -> Grads:
-        return differentiate(SurfMaxPool2dBackwardFunction.apply, ctx, grad_output)
+        return differentiate(_call_backward, ctx, grad_output)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
@@ -99,7 +113,8 @@ class SurfMaxPool2dBackwardFunction(torch.autograd.Function):
         need_input: bool,
         need_scale: bool,
     ) -> tuple[Tensor, Tensor]:
-        grads: tuple[Tensor, Tensor] = _backward_op(
+        grads: tuple[Tensor, Tensor] = direct.run_kernel(
+            _backward_op,
             grad_output,
             input,
             scale,

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from .avg_pool_ops import SurfAvgPool2dFunction
+from . import avg_pool_ops, max_pool_ops
 from .checks import PairArgument
-from .max_pool_ops import SurfMaxPool2dFunction
 from .pool_validation import check_avg_pool, check_max_pool
 
 
@@ -75,7 +74,7 @@ def surf_max_pool2d(
     arguments, batched = check_max_pool(
         input, kernel_size, stride, padding, dilation, ceil_mode, scale, guide, guide_tolerance
     )
-    output: Tensor = SurfMaxPool2dFunction.apply(*arguments)[0]
+    output, _ = max_pool_ops.surf_max_pool2d(*arguments)
     return output if batched else output.squeeze(0)
 
 
@@ -147,5 +146,5 @@ def surf_avg_pool2d(
         guide,
         guide_tolerance,
     )
-    output: Tensor = SurfAvgPool2dFunction.apply(*arguments)
+    output = avg_pool_ops.surf_avg_pool2d(*arguments)
     return output if batched else output.squeeze(0)

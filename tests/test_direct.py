@@ -2,29 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 
 import pytest
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.nn import Module
 
 from helpers import assert_same_bits
-from surfconv_ops import SurfConv2d, direct
+from surfconv_ops import SurfAvgPool2d, SurfConv2d, SurfMaxPool2d, direct
+
+LAYERS: dict[str, Callable[[], Module]] = {
+    "conv": lambda: SurfConv2d(3, 4, 3, padding=1, reference_depth=2.0),
+    "max": lambda: SurfMaxPool2d(3, padding=1, reference_depth=2.0),
+    "avg": lambda: SurfAvgPool2d(3, padding=1, reference_depth=2.0),
+}
 
 
+@pytest.mark.parametrize("name", LAYERS)
 @pytest.mark.parametrize("missing", ["transforms", "below", "level"])
-def test_without_pytorch_s_private_means(missing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pytorch_s_private_means(
+    missing: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A torch that lacks them is slower, not different."""
-    layer = SurfConv2d(3, 4, 3, padding=1, reference_depth=2.0)
-    x, depth = torch.randn(1, 3, 6, 7), torch.rand(1, 6, 7) * 4 - 0.5
-    depth.requires_grad_()
+    layer = LAYERS[name]()
+    x, depth = torch.randn(1, 3, 6, 7, requires_grad=True), torch.rand(1, 6, 7) * 4 - 0.5
+    leaves = (x, depth.requires_grad_(), *layer.parameters())
 
     def results() -> list[Tensor]:
         with torch.no_grad():
             plain = layer(x, depth)
         out = layer(x, depth)
-        return [plain, out.detach(), *torch.autograd.grad(out.sum(), (layer.weight, depth))]
+        return [plain, out.detach(), *torch.autograd.grad(out.sum(), leaves)]
 
     expected = results()
     if missing == "transforms":
