@@ -47,6 +47,19 @@ class OutputGradient {
     return {scratch, width_, kTile * width_, block.group};
   }
 
+  // Fetches what the tile behind one will read in place.
+  void fetch_behind(const Part& part, const Unit& unit) const {
+    if (!in_place_) return;
+    constexpr int64_t kLine = 64 / static_cast<int64_t>(sizeof(T));
+    const int64_t lanes = plan_.lanewise ? unit.blocks.front().padded : plan_.outputs;
+    for (int64_t m = kTile; m < 2 * kTile; ++m) {
+      for (int64_t c = 0; c < lanes; c += kLine) {
+        prefetch(reinterpret_cast<uintptr_t>(part.data) +
+                 static_cast<uintptr_t>((m * part.ld + c) * static_cast<int64_t>(sizeof(T))));
+      }
+    }
+  }
+
   void add_bias(const Part& part, const Unit& unit, int count, T* bias) const {
     for (const ChannelBlock& block : unit.blocks) {
       const T* from = part.of(block);

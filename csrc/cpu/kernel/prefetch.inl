@@ -1,7 +1,7 @@
 // The pixels that windows to come will meet first: the processor's own prefetching stops at the
 // gaps between tiles, and loses its way among the rows of a pool's window. Neighbours are at like
 // depths, so these are where the lowest taps are now, some tiles further on. (The convolution's
-// backward gained nothing by it.)
+// backward gained nothing by it but for the gradients that it reads in place.)
 
 SURFCONV_INLINE void prefetch(uintptr_t place) {
 #if defined(SURFCONV_X86)

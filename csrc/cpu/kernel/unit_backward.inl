@@ -7,6 +7,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "pixels.inl"
 #include "guide.inl"
 #include "axis.inl"
+#include "prefetch.inl"
 #include "corners.inl"
 #include "tile.inl"
 #include "gemm.inl"
