@@ -65,5 +65,7 @@ def data_folder() -> Path:
 @pytest.fixture
 def compiled() -> None:
     """Skips where only the fallback is there to test."""
-    if not hasattr(torch.ops.surfconv, "cpu_capability"):
-        pytest.skip("the compiled library is not loaded")
+    from surfconv_ops import _loader  # not before the interpreter is chosen above
+
+    if _loader.missing_library_reason is not None:
+        pytest.skip(f"the compiled library is not loaded: {_loader.missing_library_reason}")
