@@ -111,7 +111,6 @@ class BackwardTile {
            const AxisSteps& steps_x) const {
     scratch.tile.place(tensors_.scale, guide, n, begin, count, steps_y, steps_x, true);
     const Gradients gradients = output_.read(unit, n, begin, count, scratch.grad_out);
-    output_.fetch_behind(gradients, unit);
     if (target.bias != nullptr) output_.add_bias(gradients, unit, count, target.bias);
     std::fill(scratch.dot, scratch.dot + 2 * kTile * kLanes<T>, T(0));
     const int64_t unseen_read = byte_distance(target.input, zeros_.data());

@@ -24,13 +24,14 @@ class OutputGradient {
 
   int64_t width() const { return width_; }
 
-  // In place where whole blocks of the products may read it there.
+  // In place where whole blocks of the products may read it there; then the next tile's is fetched.
   Part read(const Unit& unit, int64_t n, int64_t begin, int count, T* scratch) const {
     const View& from = view_;
     const ChannelBlock& block = unit.blocks.front();
     if (in_place_ && count % kRowPad == 0) {
       const T* pixel = static_cast<const T*>(from.data) + n * from.n + begin * from.x;
       const int64_t first = plan_.lanewise ? block.first : block.group * plan_.outputs;
+      fetch_next_tile(pixel + first, plan_.lanewise ? block.padded : plan_.outputs);
       return {pixel + first, from.x, plan_.outputs, block.group};
     }
     if (plan_.lanewise) {  // a unit of lanes is one block
@@ -45,19 +46,6 @@ class OutputGradient {
       }
     }
     return {scratch, width_, kTile * width_, block.group};
-  }
-
-  // Fetches what the tile behind one will read in place.
-  void fetch_behind(const Part& part, const Unit& unit) const {
-    if (!in_place_) return;
-    constexpr int64_t kLine = 64 / static_cast<int64_t>(sizeof(T));
-    const int64_t lanes = plan_.lanewise ? unit.blocks.front().padded : plan_.outputs;
-    for (int64_t m = kTile; m < 2 * kTile; ++m) {
-      for (int64_t c = 0; c < lanes; c += kLine) {
-        prefetch(reinterpret_cast<uintptr_t>(part.data) +
-                 static_cast<uintptr_t>((m * part.ld + c) * static_cast<int64_t>(sizeof(T))));
-      }
-    }
   }
 
   void add_bias(const Part& part, const Unit& unit, int count, T* bias) const {
@@ -81,6 +69,16 @@ class OutputGradient {
   }
 
  private:
+  void fetch_next_tile(const T* tile, int64_t lanes) const {
+    constexpr int64_t bytes = sizeof(T), kLine = 64;
+    const uintptr_t start = reinterpret_cast<uintptr_t>(tile);
+    for (int64_t m = kTile; m < 2 * kTile; ++m) {
+      for (int64_t at = 0; at < lanes * bytes; at += kLine) {
+        prefetch(start + static_cast<uintptr_t>(m * view_.x * bytes + at));
+      }
+    }
+  }
+
   // to[c] += sum over pixels
   static void add_columns(const T* from, int64_t ld, int count, int64_t columns, T* to) {
     for_channels<T>(to_quads(columns), [&](int64_t c, auto width) SURFCONV_INLINED {

@@ -111,9 +111,9 @@ void pool_grad_scale(const Pool& pool, const PoolBackwardTensors& tensors, const
           sampler.start_tile(tensors.scale, images.guide(n), n, first, pixels);
           load_pixels<T>(tensors.grad_output, n, 0, pool.channels, pool.x.out, first, pixels, grads,
                          padded, padded);
+          const T* image = images.image(n);
           T along_y[kTile], along_x[kTile];
           for (int64_t m = 0; m < pixels; ++m) {
-            const T* image = images.image(n);
             sampler.list(m);
             sampler.fetch_ahead(m, image, pool.channels);
             const ScaleGradient<T> grad = body(sampler, numbers[static_cast<size_t>(worker)], image,

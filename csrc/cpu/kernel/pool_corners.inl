@@ -43,26 +43,6 @@ SURFCONV_INLINE void for_seen_taps(const PoolCorners<T>& corners, int64_t taps, 
   }
 }
 
-// Channels, a multiple of kQuad, in strips of up to four vectors, which share what is read of a
-// corner and need not wait for each other: body(first channel, strip)
-template <int Lanes, int Vectors>
-struct Strip {
-  static constexpr int lanes = Lanes, vectors = Vectors;
-};
-template <class T, class Body>
-SURFCONV_INLINE void for_strips(int64_t channels, const Body& body) {
-  constexpr int lanes = kLanes<T>;
-  int64_t c = 0;
-  for (; c + 4 * lanes <= channels; c += 4 * lanes) body(c, Strip<lanes, 4>{});
-  if (c + 2 * lanes <= channels) {
-    body(c, Strip<lanes, 2>{});
-    c += 2 * lanes;
-  }
-  for_channels<T>(channels - c, [&](int64_t rest, auto width) SURFCONV_INLINED {
-    body(c + rest, Strip<decltype(width)::lanes, 1>{});
-  });
-}
-
 // Memory of corners, [entry][pixel].
 template <class T>
 struct CornerMemory {

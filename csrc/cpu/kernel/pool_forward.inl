@@ -118,12 +118,12 @@ void pool_forward(const Pool& pool, const PoolForwardTensors& tensors, const Exe
           const int64_t first = tile * kTile, pixels = std::min<int64_t>(kTile, outputs - first);
           sampler.start_tile(tensors.scale, images.guide(n), n, first, pixels);
           T* stage = stages[static_cast<size_t>(worker)];
+          const T* image = images.image(n);
           for (int64_t m = 0; m < pixels; ++m) {
             const int64_t y = (first + m) / pool.x.out, x = (first + m) % pool.x.out;
             T* to = direct
                         ? static_cast<T*>(output.data) + n * output.n + y * output.y + x * output.x
                         : stage + m * padded;
-            const T* image = images.image(n);
             sampler.list(m);
             sampler.fetch_ahead(m, image, pool.channels);
             body(sampler, image, m, n * outputs + first + m, to);

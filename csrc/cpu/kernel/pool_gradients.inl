@@ -17,18 +17,17 @@ SURFCONV_INLINE V masked(M mask, V value) {
 }
 
 // Which tap has won each channel of a strip. It is random, and so would be branches on it.
-template <class T, class Strip>
+template <class T, class S>
 struct WinnersOf {
   using Number = std::conditional_t<sizeof(T) == 8, int64_t, int32_t>;
-  using Numbers = Vec<Number, Strip::lanes>;
-  Numbers winner[Strip::vectors];
+  using Numbers = Vec<Number, S::lanes>;
+  Numbers winner[S::vectors];
 
   template <class W>
   explicit SURFCONV_INLINE WinnersOf(const W* from) {
 #pragma GCC unroll 4
-    for (int i = 0; i < Strip::vectors; ++i) {
-      winner[i] =
-          __builtin_convertvector(load<Vec<W, Strip::lanes>>(from + i * Strip::lanes), Numbers);
+    for (int i = 0; i < S::vectors; ++i) {
+      winner[i] = __builtin_convertvector(load<Vec<W, S::lanes>>(from + i * S::lanes), Numbers);
     }
   }
   // Lanes of -1 in vector i where tap t has won.
@@ -38,11 +37,11 @@ struct WinnersOf {
 };
 
 // to += weight * share
-template <class Strip, class T, class V>
-SURFCONV_INLINE void add_strip(Strip, T weight, const V (&share)[Strip::vectors], T* to) {
+template <class S, class T, class V>
+SURFCONV_INLINE void add_strip(S, T weight, const V (&share)[S::vectors], T* to) {
 #pragma GCC unroll 4
-  for (int i = 0; i < Strip::vectors; ++i) {
-    T* place = to + i * Strip::lanes;
+  for (int i = 0; i < S::vectors; ++i) {
+    T* place = to + i * S::lanes;
     store(place, V(load<V>(place) + weight * share[i]));
   }
 }
@@ -164,7 +163,7 @@ ScaleGradient<T> slopes_of_average(const PoolCorners<T>& corners, bool weighted,
     gain /= static_cast<double>(divisor);
     gain_x /= static_cast<double>(divisor);
   }
-  const auto less = [&](T slope, T weight, double by) SURFCONV_INLINED {
+  const auto net_slope = [&](T slope, T weight, double by) SURFCONV_INLINED {
     if (!gains) return slope;
     return static_cast<T>(static_cast<double>(slope) - static_cast<double>(weight) * by);
   };
@@ -175,9 +174,9 @@ ScaleGradient<T> slopes_of_average(const PoolCorners<T>& corners, bool weighted,
     V along[S::vectors] = {}, along_x[S::vectors] = {};
     for (int64_t q = 0; q < corners.count; ++q) {
       const int64_t at = q * corners.step;
-      const T slope = less(corners.slope[at], corners.weight[at], gain);
+      const T slope = net_slope(corners.slope[at], corners.weight[at], gain);
       const T slope_x =
-          Of == Slopes::two ? less(corners.slope_x[at], corners.weight[at], gain_x) : T(0);
+          Of == Slopes::two ? net_slope(corners.slope_x[at], corners.weight[at], gain_x) : T(0);
       // What is not finite concerns nothing that does not move.
       if (slope == 0 && slope_x == 0) continue;
       const T* pixel = image + corners.offset[at] + c;

@@ -121,6 +121,26 @@ SURFCONV_INLINE void for_channels(int64_t channels, const Body& body) {
   }
 }
 
+// Channels, a multiple of kQuad, in strips of up to four vectors, which share what is read for all
+// of them and need not wait for each other: body(first channel, strip)
+template <int Lanes, int Vectors>
+struct Strip {
+  static constexpr int lanes = Lanes, vectors = Vectors;
+};
+template <class T, class Body>
+SURFCONV_INLINE void for_strips(int64_t channels, const Body& body) {
+  constexpr int lanes = kLanes<T>;
+  int64_t c = 0;
+  for (; c + 4 * lanes <= channels; c += 4 * lanes) body(c, Strip<lanes, 4>{});
+  if (c + 2 * lanes <= channels) {
+    body(c, Strip<lanes, 2>{});
+    c += 2 * lanes;
+  }
+  for_channels<T>(channels - c, [&](int64_t rest, auto width) SURFCONV_INLINED {
+    body(c + rest, Strip<decltype(width)::lanes, 1>{});
+  });
+}
+
 // The sum of a vector's parts, each as long as V.
 template <class V, class T, class Whole>
 SURFCONV_INLINE V fold(Whole v) {
