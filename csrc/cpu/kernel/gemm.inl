@@ -2,8 +2,10 @@
 // Accumulators are named variables: arrays of vectors spill under g++ 12.
 #define SURFCONV_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5) X(6) X(7) X(8) X(9) X(10) X(11)
 
-// A[row, k] at a[row * lda + k], or with TransposedA at a[row + k * lda].
-template <class T, int ROWS, int VECTORS, int L, bool TransposedA>
+// A[row, k] at a[row * lda + k], or with TransposedA at a[row + k * lda]. STEPS of the depth at
+// once, so that where a row of A begins, which may not stay in a register, is read once for all of
+// them.
+template <class T, int ROWS, int VECTORS, int L, bool TransposedA, int STEPS>
 SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t lda,
                                 const T* __restrict b, int64_t ldb, T* __restrict c, int64_t ldc,
                                 const T* initial) {
@@ -18,18 +20,31 @@ SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t ld
     if constexpr (VECTORS > 1) right##R = load<V>(from + L);    \
   }
   SURFCONV_ROWS(SURFCONV_LOAD)
-  for (int64_t k = 0; k < depth; ++k) {
-    const V b0 = load<V>(b);
-    const V b1 = VECTORS > 1 ? load<V>(b + (VECTORS > 1 ? L : 0)) : V{};
-#define SURFCONV_FMA(R)                                \
-  if constexpr (R < ROWS) {                            \
-    const T value = a[R * row_step];                   \
-    left##R += value * b0;                             \
-    if constexpr (VECTORS > 1) right##R += value * b1; \
+  const auto advance = [&](auto steps) SURFCONV_INLINED {
+    constexpr int N = decltype(steps)::value;
+    V b0[N], b1[N];
+#pragma GCC unroll 4
+    for (int i = 0; i < N; ++i) {
+      b0[i] = load<V>(b + i * ldb);
+      if constexpr (VECTORS > 1) b1[i] = load<V>(b + i * ldb + L);
+    }
+#define SURFCONV_FMA(R)                                     \
+  if constexpr (R < ROWS) {                                 \
+    const T* row = a + R * row_step;                        \
+    _Pragma("GCC unroll 4") for (int i = 0; i < N; ++i) {   \
+      const T value = row[i * depth_step];                  \
+      left##R += value * b0[i];                             \
+      if constexpr (VECTORS > 1) right##R += value * b1[i]; \
+    }                                                       \
   }
     SURFCONV_ROWS(SURFCONV_FMA)
-    a += depth_step;
-    b += ldb;
+    a += N * depth_step;
+    b += N * ldb;
+  };
+  int64_t k = 0;
+  for (; k + STEPS <= depth; k += STEPS) advance(std::integral_constant<int, STEPS>{});
+  if constexpr (STEPS > 1) {
+    for (; k < depth; ++k) advance(std::integral_constant<int, 1>{});
   }
 #define SURFCONV_STORE(R)                                        \
   if constexpr (R < ROWS) {                                      \
@@ -80,9 +95,10 @@ void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_
   static_assert(MOST % R == 0 && MOST % S == 0, "whole blocks only");
   const int64_t row_step = TransposedA ? 1 : lda;
   const auto blocks = [&](auto block_rows, auto vectors, auto lanes) {
-    constexpr int N = decltype(block_rows)::value;
+    constexpr int N = decltype(block_rows)::value, VECTORS = decltype(vectors)::value;
+    constexpr int STEPS = VECTORS == 1 && !TransposedA ? SURFCONV_GEMM_NARROW_STEPS : 1;
     for (int64_t r = 0; r < rows; r += N) {
-      gemm_block<T, N, decltype(vectors)::value, decltype(lanes)::value, TransposedA>(
+      gemm_block<T, N, VECTORS, decltype(lanes)::value, TransposedA, STEPS>(
           depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc, initial);
     }
   };
