@@ -150,15 +150,13 @@ __attribute__((noinline)) void lane_pixels(const LaneScratch<T>& scratch, int m,
   }
 }
 
-// body(first lane, Fixed<lanes>): as many vectors at a time as sums stay in registers. Where there
-// are few, eight of one pixel were slower than four.
+// body(first lane, Fixed<lanes>): as many vectors at a time as leave registers to what they share;
+// eight or nine, which six would leave too few of, by fours.
 template <class T, class Body>
 void for_fixed_lanes(int64_t lanes, const Body& body) {
   constexpr int64_t L = kLanes<T>;
   int64_t c = 0;
-  if constexpr (kManyRegisters) {
-    for (; c + 6 * L <= lanes; c += 6 * L) body(c, Fixed<6 * L>{});
-  }
+  for (; lanes - c >= 6 * L && (lanes - c) / (2 * L) != 4; c += 6 * L) body(c, Fixed<6 * L>{});
   for (; c + 4 * L <= lanes; c += 4 * L) body(c, Fixed<4 * L>{});
   for (; c + 2 * L <= lanes; c += 2 * L) body(c, Fixed<2 * L>{});
   for (; c + L <= lanes; c += L) body(c, Fixed<L>{});
