@@ -36,7 +36,7 @@ class BackwardTile {
         output_(conv, plan_, tensors.grad_output),
         width_(output_.width()),
         ld_rows_(
-            pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowPad)) +
+            pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowBlock)) +
             16),
         needs_matrix_(tensors.grad_input.data != nullptr || tensors.grad_scale.data != nullptr),
         zeros_(static_cast<size_t>(std::max(plan_.row, ld_rows_) + 2 * kLanes<T>), T(0)) {}
@@ -49,7 +49,7 @@ class BackwardTile {
     if (plan_.lanewise) return plan_.taps * plan_.weights_of_tap() * block.padded;
     if (swapped_) return round_up(plan_.outputs, kSwappedRows) * weight_row(block);
     // Each block of taps is padded by itself.
-    return (plan_.taps * block.padded + kRowPad) * width_;
+    return (plan_.taps * block.padded + kRowBlock) * width_;
   }
   int64_t weight_elements(const Unit& unit) const {
     int64_t total = 0;
@@ -233,7 +233,7 @@ class BackwardTile {
       // What pads the matrix would else add whatever lies there.
       using Quad = Vec<T, kQuad>;
       const int64_t used = taps * block.padded;
-      const int64_t padded = swapped_ ? pad_width<T>(used) : round_up(used, kRowPad);
+      const int64_t padded = swapped_ ? pad_width<T>(used) : round_up(used, kRowBlock);
       for (int64_t column = used; column < padded; column += kQuad) {
         for (int m = 0; m < count; ++m) store(scratch.rows + m * ld_rows_ + column, Quad{});
       }
@@ -242,8 +242,8 @@ class BackwardTile {
                                          ld, scratch.rows, ld_rows_,
                                          weight + first_tap * block.padded, weight_row(block));
       } else {
-        gemm_transposed<T, kRowPad>(padded, plan_.outputs, count, scratch.rows, ld_rows_, from, ld,
-                                    weight + first_tap * block.padded * width_, width_);
+        gemm_transposed<T, kRowBlock>(padded, plan_.outputs, count, scratch.rows, ld_rows_, from,
+                                      ld, weight + first_tap * block.padded * width_, width_);
       }
       return;
     }

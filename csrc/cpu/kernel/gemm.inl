@@ -57,8 +57,9 @@ SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t ld
 #undef SURFCONV_STORE
 }
 
-// Rows of A and C are padded to it, so that there is one block shape for each width of panel.
-constexpr int64_t kRowPad = 12;
+// Rows of the largest block, and what a tile's rows of A and C are padded to.
+constexpr int kRowBlock = 12, kRowPad = 6;
+static_assert(kRowPad % SURFCONV_GEMM_ROWS == 0 && kRowBlock % kRowPad == 0, "whole blocks only");
 
 // C's columns are cut into panels of two vectors, and what is left into one of two vectors, one, or
 // half a one: the narrowest that holds it.
@@ -85,21 +86,26 @@ SURFCONV_INLINE void for_panels(int64_t width, const Body& body) {
   }
 }
 
-// MOST: rows of a block at most, a divisor of `rows`.
-template <class T, bool TransposedA, int MOST>
+// MOST: rows of a block at most; `rows` is a multiple of UNIT.
+template <class T, bool TransposedA, int MOST, int UNIT = MOST>
 void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_t lda, const T* b,
                 int64_t ldb, T* c, int64_t ldc, const T* initial) {
   constexpr int L = kLanes<T>, H = kHalfLanes<T>;
   constexpr int R = std::min(MOST, SURFCONV_GEMM_ROWS);
   constexpr int S = std::min(MOST, SURFCONV_GEMM_NARROW_ROWS);
-  static_assert(MOST % R == 0 && MOST % S == 0, "whole blocks only");
+  static_assert(UNIT % R == 0 && MOST % UNIT == 0 && MOST % S == 0, "whole blocks only");
   const int64_t row_step = TransposedA ? 1 : lda;
   const auto blocks = [&](auto block_rows, auto vectors, auto lanes) {
     constexpr int N = decltype(block_rows)::value, VECTORS = decltype(vectors)::value;
     constexpr int STEPS = VECTORS == 1 && !TransposedA ? SURFCONV_GEMM_NARROW_STEPS : 1;
-    for (int64_t r = 0; r < rows; r += N) {
-      gemm_block<T, N, VECTORS, decltype(lanes)::value, TransposedA, STEPS>(
+    const auto multiply = [&](auto some, int64_t r) SURFCONV_INLINED {
+      gemm_block<T, decltype(some)::value, VECTORS, decltype(lanes)::value, TransposedA, STEPS>(
           depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc, initial);
+    };
+    int64_t r = 0;
+    for (; r + N <= rows; r += N) multiply(block_rows, r);
+    if constexpr (UNIT % N != 0) {
+      for (; r < rows; r += UNIT) multiply(std::integral_constant<int, UNIT>{}, r);
     }
   };
   using One = std::integral_constant<int, 1>;
@@ -119,8 +125,9 @@ template <class T>
 void gemm_packed(int64_t rows, int64_t width, int64_t depth, const T* a, int64_t lda,
                  const T* packed, T* c, int64_t ldc, const T* initial) {
   for_panels<T>(width, [&](int64_t column, int64_t columns) {
-    gemm_panel<T, false, kRowPad>(columns, rows, depth, a, lda, packed + column * depth, columns,
-                                  c + column, ldc, initial != nullptr ? initial + column : nullptr);
+    gemm_panel<T, false, kRowBlock, kRowPad>(columns, rows, depth, a, lda, packed + column * depth,
+                                             columns, c + column, ldc,
+                                             initial != nullptr ? initial + column : nullptr);
   });
 }
 

@@ -203,8 +203,9 @@ class PointwiseBackward {
       input_.load_rows(n, channel, block.count, begin, count, scratch.in, ld);
       in = scratch.in;
     }
-    const int64_t padded = round_up(block.count, 4), whole = padded / kRowPad * kRowPad;
-    gemm_transposed<T, kRowPad>(whole, plan_.outputs, count, in, ld, grad, ld_grad, weight, width_);
+    const int64_t padded = round_up(block.count, 4), whole = padded / kRowBlock * kRowBlock;
+    gemm_transposed<T, kRowBlock>(whole, plan_.outputs, count, in, ld, grad, ld_grad, weight,
+                                  width_);
     gemm_transposed<T, 4>(padded - whole, plan_.outputs, count, in + whole, ld, grad, ld_grad,
                           weight + whole * width_, width_);
   }
@@ -263,7 +264,7 @@ class PointwiseBackward {
               weight + row * columns + column, columns, nullptr);
         };
         step == 4 ? multiply(std::integral_constant<int, 4>{})
-                  : multiply(std::integral_constant<int, static_cast<int>(kRowPad)>{});
+                  : multiply(std::integral_constant<int, kRowBlock>{});
       });
     }
   }

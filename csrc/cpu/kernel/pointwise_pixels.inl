@@ -134,11 +134,13 @@ static_assert(kPlaneTile % kLanes<float> == 0, "whole panels only");
 // Whether a product reads planes where they lie: many of them, a power of two apart, would drive
 // each other from the cache before the next block of rows comes to them.
 SURFCONV_INLINE bool reads_in_place(int64_t planes, int64_t rows) {
-  return planes <= 16 || rows <= kRowPad;
+  return planes <= 16 || rows <= kRowBlock;
 }
 
 // Rows of a product whose left factor is packed for it: blocks of twelve, then of four.
-SURFCONV_INLINE int64_t row_block(int64_t rows_left) { return rows_left >= kRowPad ? kRowPad : 4; }
+SURFCONV_INLINE int64_t row_block(int64_t rows_left) {
+  return rows_left >= kRowBlock ? kRowBlock : 4;
+}
 
 // packed: [block of rows][depth][rows of the block], of left(row, k); rows a multiple of four.
 template <class T, class Left>
@@ -164,7 +166,7 @@ void multiply_planes(int64_t rows, int64_t depth, const T* packed, const T* b, i
                                                    ldc, initial);
       };
       block == 4 ? multiply(std::integral_constant<int, 4>{})
-                 : multiply(std::integral_constant<int, static_cast<int>(kRowPad)>{});
+                 : multiply(std::integral_constant<int, kRowBlock>{});
     });
   }
 }
