@@ -82,6 +82,25 @@ def test_blocks_of_taps(channels: int, out_channels: int) -> None:
     check(lay_scale(make_problem(1, channels, out_channels, (7, 8), 5, padding=2), "holes"))
 
 
+@pytest.mark.parametrize("size", [(7, 7), (2, 60), (17, 3), (1, 1)])
+@pytest.mark.parametrize("kernel", [3, (5, 3), (4, 3), (1, 5)])
+@pytest.mark.parametrize(("channels", "out_channels"), [(12, 3), (16, 16), (72, 20)])
+@pytest.mark.parametrize("guide", ["none", "depth"])
+def test_rows_of_taps_outside(
+    size: tuple[int, int],
+    kernel: int | tuple[int, int],
+    channels: int,
+    out_channels: int,
+    guide: str,
+) -> None:
+    """Blocks of pixels of which no tap of some rows sees anything, or none at all."""
+    problem = make_problem(
+        2, channels, out_channels, size, kernel, padding=2, guide=guide, guide_tolerance=1.0
+    )
+    scale = torch.linspace(1.3, 4.4, problem.scale.shape[-2])[:, None]
+    check(replace(problem, scale=scale.expand(problem.scale.shape).contiguous()))
+
+
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("per_group", [(1, 1), (1, 3), (2, 2), (3, 4), (4, 1), (4, 4), (5, 2)])
 @pytest.mark.parametrize("groups", [2, 9, 32])

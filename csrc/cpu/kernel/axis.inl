@@ -2,6 +2,15 @@
 // Loops over a tile always run to its full length, a number the compiler knows; entries beyond the
 // tile's pixels hold the geometry of a scale of zero and are not used.
 constexpr int kTile = 48;
+// The pixels of a tile are padded to it, whole blocks of a product.
+constexpr int kRowPad = 6;
+static_assert(kTile % kRowPad == 0, "no more than a tile");
+
+struct Rows {
+  int64_t begin, end;
+  int64_t count() const { return end - begin; }
+  bool has(int64_t row) const { return row >= begin && row < end; }
+};
 
 // Taps gathered at a time are whole rows of the kernel where a row has no more taps than this.
 constexpr int64_t kMostTaps = 64;

@@ -110,6 +110,7 @@ class BackwardTile {
            int64_t n, int64_t begin, int count, const AxisSteps& steps_y,
            const AxisSteps& steps_x) const {
     scratch.tile.place(tensors_.scale, guide, n, begin, count, steps_y, steps_x, true);
+    if (!plan_.lanewise) scratch.tile.find_seen(count, true);
     const Gradients gradients = output_.read(unit, n, begin, count, scratch.grad_out);
     if (target.bias != nullptr) output_.add_bias(gradients, unit, count, target.bias);
     std::fill(scratch.dot, scratch.dot + 2 * kTile * kLanes<T>, T(0));
@@ -213,9 +214,15 @@ class BackwardTile {
     if (!plan_.lanewise) {
       const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
       const int64_t index = (&block - unit.blocks.data()) + block_index(unit);
-      gemm_packed<T>(round_up(count, kRowPad), taps * block.padded, plan_.outputs, from, ld,
-                     weights_.get() + (index * tap_blocks + first_tap / taps_) * stride_,
-                     scratch.rows, ld_rows_, zeros_.data());
+      const T* weights = weights_.get() + (index * tap_blocks + first_tap / taps_) * stride_;
+      scratch.tile.for_seen(first_tap, taps, [&](const SeenTaps& pixels, Rows seen) {
+        const GemmPart part{pixels.begin,
+                            pixels.end - pixels.begin,
+                            {0, plan_.outputs},
+                            {seen.begin * block.padded, seen.end * block.padded}};
+        gemm_packed<T>(part, taps * block.padded, plan_.outputs, from, ld, weights, scratch.rows,
+                       ld_rows_, zeros_.data());
+      });
       return;
     }
     with_mix<T>(plan_, [&](auto mix) {
@@ -242,8 +249,16 @@ class BackwardTile {
                                          ld, scratch.rows, ld_rows_,
                                          weight + first_tap * block.padded, weight_row(block));
       } else {
-        gemm_transposed<T, kRowBlock>(padded, plan_.outputs, count, scratch.rows, ld_rows_, from,
-                                      ld, weight + first_tap * block.padded * width_, width_);
+        T* to = weight + first_tap * block.padded * width_;
+        scratch.tile.for_seen(first_tap, taps, [&](const SeenTaps& pixels, Rows seen) {
+          const int64_t row = seen.begin * block.padded / kRowBlock * kRowBlock;
+          const int64_t end = round_up(seen.end * block.padded, kRowBlock), m = pixels.begin;
+          if (seen.count() == 0) return;
+          gemm_transposed<T, kRowBlock>(end - row, plan_.outputs,
+                                        std::min<int64_t>(pixels.end, count) - m,
+                                        scratch.rows + m * ld_rows_ + row, ld_rows_, from + m * ld,
+                                        ld, to + row * width_, width_);
+        });
       }
       return;
     }

@@ -157,6 +157,7 @@ class Forward {
         }
       });
     }
+    if (gathers && !plan_.lanewise) scratch.tile.find_seen(count, false);
     for (int64_t first_tap = 0; gathers && first_tap < plan_.taps; first_tap += taps_) {
       const int64_t taps = std::min(taps_, plan_.taps - first_tap);
       if (scratch.tile.needs_list()) {
@@ -173,9 +174,17 @@ class Forward {
           multiply_lanes(scratch, block, first_tap, taps, count, out, ld_out);
         } else {
           const bool first = first_tap == 0 && block.first == 0;
-          gemm_packed<T>(round_up(count, kRowPad), plan_.outputs, taps * step, scratch.rows,
-                         ld_rows_, packed(block, first_tap, taps), out + block.group * group_step,
-                         ld_out, first ? initial_.data() + block.group * width_ : nullptr);
+          const T* weights = packed(block, first_tap, taps);
+          T* to = out + block.group * group_step;
+          const T* initial = first ? initial_.data() + block.group * width_ : nullptr;
+          scratch.tile.for_seen(first_tap, taps, [&](const SeenTaps& pixels, Rows seen) {
+            const GemmPart part{pixels.begin,
+                                pixels.end - pixels.begin,
+                                {seen.begin * step, seen.end * step},
+                                {0, plan_.outputs}};
+            gemm_packed<T>(part, plan_.outputs, taps * step, scratch.rows, ld_rows_, weights, to,
+                           ld_out, initial);
+          });
         }
       }
     }

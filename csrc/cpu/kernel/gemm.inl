@@ -57,8 +57,7 @@ SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t ld
 #undef SURFCONV_STORE
 }
 
-// Rows of the largest block, and what a tile's rows of A and C are padded to.
-constexpr int kRowBlock = 12, kRowPad = 6;
+constexpr int kRowBlock = 12;  // rows of the largest block
 static_assert(kRowPad % SURFCONV_GEMM_ROWS == 0 && kRowBlock % kRowPad == 0, "whole blocks only");
 
 // C's columns are cut into panels of two vectors, and what is left into one of two vectors, one, or
@@ -119,16 +118,35 @@ void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_
   }
 }
 
+// Rows of a product, a multiple of kRowPad of them, that need a part of it.
+struct GemmPart {
+  int64_t row, rows;
+  Rows depth;    // where A is not zero
+  Rows columns;  // that anybody reads
+};
+
 // B packed panel after panel, each [depth][columns of the panel]; initial: a row of start values
-// for all of C's rows, or null to add to C. rows is padded to kRowPad by the caller's buffers.
+// for all of C's rows, or null to add to C.
 template <class T>
-void gemm_packed(int64_t rows, int64_t width, int64_t depth, const T* a, int64_t lda,
+void gemm_packed(const GemmPart& part, int64_t width, int64_t depth, const T* a, int64_t lda,
                  const T* packed, T* c, int64_t ldc, const T* initial) {
+  a += part.row * lda + part.depth.begin;
+  c += part.row * ldc;
   for_panels<T>(width, [&](int64_t column, int64_t columns) {
-    gemm_panel<T, false, kRowBlock, kRowPad>(columns, rows, depth, a, lda, packed + column * depth,
+    if (column >= part.columns.end || column + columns <= part.columns.begin) return;
+    gemm_panel<T, false, kRowBlock, kRowPad>(columns, part.rows, part.depth.count(), a, lda,
+                                             packed + column * depth + part.depth.begin * columns,
                                              columns, c + column, ldc,
                                              initial != nullptr ? initial + column : nullptr);
   });
+}
+
+// All of the product; rows is padded to kRowPad by the caller's buffers.
+template <class T>
+void gemm_packed(int64_t rows, int64_t width, int64_t depth, const T* a, int64_t lda,
+                 const T* packed, T* c, int64_t ldc, const T* initial) {
+  const GemmPart whole{0, rows, {0, depth}, {0, width}};
+  gemm_packed<T>(whole, width, depth, a, lda, packed, c, ldc, initial);
 }
 
 // C[rows x width] += A^T * B with A [depth][lda] and B [depth][ldb] as they lie; MOST divides rows.

@@ -2,12 +2,6 @@
 // rows and the input rows that their taps may touch. Copies that a pass makes (the input with its
 // channels innermost, gradients in the compute type) are bounded however large the image is, unless
 // its taps reach across all of it. By shape and scale alone, so that sums keep their order.
-struct Rows {
-  int64_t begin, end;
-  int64_t count() const { return end - begin; }
-  bool has(int64_t row) const { return row >= begin && row < end; }
-};
-
 struct Pass {
   int64_t first_image, images;
   Rows out;

@@ -9,6 +9,12 @@ struct Run {
   Place place;
 };
 
+// Successive pixels of a tile, whole blocks of a product, that see something of the same taps.
+struct SeenTaps {
+  int begin, end;  // may end beyond the tile's pixels
+  Rows taps;       // whole rows of the kernel
+};
+
 // One worker's view of the tile it is at: the geometry of up to kTile flat output pixels.
 template <class T>
 class Tile {
@@ -86,6 +92,45 @@ class Tile {
       fill(int64_t{});
     }
     find_runs(bounds, count);
+  }
+
+  // What for_seen goes by, of the tile's `count` pixels. Of listed corners nothing is left out.
+  void find_seen(int count, bool derivatives) {
+    const T* present = derivatives ? rows_.inside : rows_.weight;
+    const int padded = static_cast<int>(round_up(count, kRowPad));
+    seen_[0] = {0, padded, {0, conv_.y.kernel * conv_.x.kernel}};
+    seen_count_ = 1;
+    if (!has(Place::other) || needs_list() || see_rows_between(present)) return;
+    seen_count_ = 0;
+    for (int begin = 0; begin < padded; begin += kRowPad) {
+      const int end = std::min(begin + kRowPad, count);
+      Rows rows{0, 0};
+      for (int64_t t = 0; t < conv_.y.kernel; ++t) {
+        const T* lower = present + 2 * t * kTile;
+        const T* upper = conv_.y.fixed(t) ? lower : lower + kTile;
+        bool some = false;
+        for (int m = begin; m < end; ++m) some |= (lower[m] != 0) | (upper[m] != 0);
+        if (some) rows = {rows.count() == 0 ? t : rows.begin, t + 1};
+      }
+      const Rows taps{rows.begin * conv_.x.kernel, rows.end * conv_.x.kernel};
+      SeenTaps* last = seen_count_ == 0 ? nullptr : &seen_[seen_count_ - 1];
+      if (last != nullptr && last->taps.begin == taps.begin && last->taps.end == taps.end) {
+        last->end = begin + kRowPad;
+      } else {
+        seen_[seen_count_++] = {begin, begin + kRowPad, taps};
+      }
+    }
+  }
+
+  // body(pixels, those of the `taps` from first_tap on of which they see something, counted from
+  // it). The others bring zeros, which a product need not meet.
+  template <class Body>
+  SURFCONV_INLINE void for_seen(int64_t first_tap, int64_t taps, const Body& body) const {
+    for (int i = 0; i < seen_count_; ++i) {
+      const Rows seen = seen_[i].taps;
+      const int64_t begin = std::clamp(seen.begin - first_tap, int64_t{0}, taps);
+      body(seen_[i], Rows{begin, std::clamp(seen.end - first_tap, begin, taps)});
+    }
   }
 
   template <bool Writes, Slopes S>
@@ -193,10 +238,25 @@ class Tile {
     }
   }
 
+  // Whether all pixels see something of the outermost rows of taps, and so of those between.
+  bool see_rows_between(const T* present) const {
+    const T* first = present;
+    const T* last = present + 2 * (conv_.y.kernel - 1) * kTile;
+    const int64_t upper = conv_.y.fixed(0) ? 0 : kTile;
+    int unseen = 0;
+    for (int m = 0; m < kTile; ++m) {
+      unseen |=
+          ((first[m] == 0) & (first[m + upper] == 0)) | ((last[m] == 0) & (last[m + upper] == 0));
+    }
+    return unseen == 0;
+  }
+
   const Conv& conv_;
   const bool narrow_;
   Run runs_[kTile];
   int run_count_ = 0;
+  SeenTaps seen_[kTile / kRowPad];
+  int seen_count_ = 0;
   AxisTable<T> rows_, columns_;
   CornerTable<T> corners_;
   GuideTile<T> guide_;
