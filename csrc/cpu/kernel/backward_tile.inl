@@ -6,7 +6,7 @@
 template <class T>
 class BackwardTile {
  public:
-  struct alignas(kApart) Scratch {
+  struct Scratch {
     Tile<T> tile;
     T* grad_out;  // [groups of the unit][kTile][width]
     T* rows;      // [kTile][ld_rows]: gradient of the gathered matrix, then the matrix

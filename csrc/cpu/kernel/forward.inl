@@ -61,7 +61,7 @@ class Forward {
   }
 
  private:
-  struct alignas(kApart) Scratch {
+  struct Scratch {
     Tile<T> tile;
     T* rows;  // gathered matrix [kTile][ld_rows]
     T* out;   // [kTile][groups * width]

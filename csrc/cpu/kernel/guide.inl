@@ -24,7 +24,7 @@ struct Patch {
 // Least and greatest values of squares around the pixels of a patch. What lies outside the image
 // counts for nothing, what is not finite is less and greater than everything.
 template <class T>
-class alignas(kApart) Extremes {
+class Extremes {
  public:
   Extremes(int64_t rows, int64_t columns, int64_t most_reach)
       : margin_(most_reach),

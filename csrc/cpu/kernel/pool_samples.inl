@@ -1,6 +1,6 @@
 // Everything about the samples of one worker's tile.
 template <Edges E, Slopes S, class T>
-class alignas(kApart) PoolSampler {
+class PoolSampler {
  public:
   static int64_t need(const Pool& pool) {
     int64_t patterns = 0;
