@@ -6,10 +6,11 @@ constexpr int kTile = 48;
 constexpr int kRowPad = 6;
 static_assert(kTile % kRowPad == 0, "no more than a tile");
 
-struct Rows {
+// Of rows, taps or what else is counted.
+struct Range {
   int64_t begin, end;
   int64_t count() const { return end - begin; }
-  bool has(int64_t row) const { return row >= begin && row < end; }
+  bool has(int64_t number) const { return number >= begin && number < end; }
 };
 
 // Taps gathered at a time are whole rows of the kernel where a row has no more taps than this.

@@ -149,8 +149,8 @@ class Backward {
 
   bool is_far(const Slot& slot, int64_t n, int64_t first, int64_t count) const {
     const T largest = largest_scale<T>(conv_, tensors_.scale, n, first, count);
-    const Rows out{first / conv_.x.out, (first + count - 1) / conv_.x.out + 1};
-    const Rows rows = rows_around(conv_, out, spread_of(conv_, largest));
+    const Range out{first / conv_.x.out, (first + count - 1) / conv_.x.out + 1};
+    const Range rows = rows_around(conv_, out, spread_of(conv_, largest));
     return rows.begin < slot.reach.begin || rows.end > slot.reach.end;
   }
 

@@ -215,11 +215,9 @@ class BackwardTile {
       const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
       const int64_t index = (&block - unit.blocks.data()) + block_index(unit);
       const T* weights = weights_.get() + (index * tap_blocks + first_tap / taps_) * stride_;
-      scratch.tile.for_seen(first_tap, taps, [&](const SeenTaps& pixels, Rows seen) {
-        const GemmPart part{pixels.begin,
-                            pixels.end - pixels.begin,
-                            {0, plan_.outputs},
-                            {seen.begin * block.padded, seen.end * block.padded}};
+      scratch.tile.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
+        const GemmPart part{
+            pixels, {0, plan_.outputs}, {seen.begin * block.padded, seen.end * block.padded}};
         gemm_packed<T>(part, taps * block.padded, plan_.outputs, from, ld, weights, scratch.rows,
                        ld_rows_, zeros_.data());
       });
@@ -250,7 +248,7 @@ class BackwardTile {
                                          weight + first_tap * block.padded, weight_row(block));
       } else {
         T* to = weight + first_tap * block.padded * width_;
-        scratch.tile.for_seen(first_tap, taps, [&](const SeenTaps& pixels, Rows seen) {
+        scratch.tile.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
           const int64_t row = seen.begin * block.padded / kRowBlock * kRowBlock;
           const int64_t end = round_up(seen.end * block.padded, kRowBlock), m = pixels.begin;
           if (seen.count() == 0) return;

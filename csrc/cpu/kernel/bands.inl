@@ -6,9 +6,9 @@ struct Slot {
   int64_t first_image, images;  // within the pass
   int phase;                    // slots of a phase scatter to different rows
   int64_t partial;              // of weights and bias: slots of different phases share it
-  Rows out;
-  Rows reach;  // input rows
-  bool far;    // some tiles reach beyond it
+  Range out;
+  Range reach;  // input rows
+  bool far;     // some tiles reach beyond it
 };
 constexpr int kPhases = 2;
 
@@ -88,7 +88,7 @@ std::vector<Slot> make_slots(const Conv& conv, const View& scale, const Pass& pa
   const int64_t bands = shares * phases;
   for (int64_t band = 0; band < pass.images * bands; ++band) {
     const int64_t k = band % bands;
-    const Rows out{pass.out.begin + rows * k / bands, pass.out.begin + rows * (k + 1) / bands};
+    const Range out{pass.out.begin + rows * k / bands, pass.out.begin + rows * (k + 1) / bands};
     slots.push_back(
         {band / bands, 1, static_cast<int>(k % phases), band / phases, out, pass.in, false});
     if (phases > 1) spreads->reach(limit, slots.back());

@@ -177,11 +177,8 @@ class Forward {
           const T* weights = packed(block, first_tap, taps);
           T* to = out + block.group * group_step;
           const T* initial = first ? initial_.data() + block.group * width_ : nullptr;
-          scratch.tile.for_seen(first_tap, taps, [&](const SeenTaps& pixels, Rows seen) {
-            const GemmPart part{pixels.begin,
-                                pixels.end - pixels.begin,
-                                {seen.begin * step, seen.end * step},
-                                {0, plan_.outputs}};
+          scratch.tile.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
+            const GemmPart part{pixels, {seen.begin * step, seen.end * step}, {0, plan_.outputs}};
             gemm_packed<T>(part, plan_.outputs, taps * step, scratch.rows, ld_rows_, weights, to,
                            ld_out, initial);
           });

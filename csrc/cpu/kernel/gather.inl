@@ -79,7 +79,7 @@ void gather_tap(const TapCorners<T>& tap, const char* base, int begin, int end, 
 // Whole rows of taps of the interior pixels begin .. end-1, one tap after the other, a step apart,
 // at to + m * ld.
 template <int K, class T, class Channels>
-void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Range taps_y,
                      const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
                      int64_t step) {
   using W = typename WeightOf<T, Channels>::type;
@@ -98,7 +98,7 @@ void gather_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, 
 }
 
 template <int K, class T, class Channels>
-void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Range taps_y,
                  const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
                  int64_t step) {
   const Axis axis_y = conv.y, axis_x = conv.x;
@@ -118,7 +118,7 @@ void gather_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows
 
 // Whole rows of taps of the pixels begin .. end-1, of which part may lie outside the image.
 template <class T, class Channels>
-void gather_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+void gather_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Range taps_y,
                  const char* base, int begin, int end, Channels channels, T* to, int64_t ld,
                  int64_t step) {
   const Axis axis_y = conv.y, axis_x = conv.x;
@@ -143,7 +143,7 @@ template <class T>
 void gather_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64_t taps,
                  const char* base, int64_t channels, T* to, int64_t ld, int64_t step,
                  bool corners_only = false) {
-  const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
+  const Range taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
   const bool listed = tile.needs_list();
   tile.for_runs([&](const Run& run) {
     if (run.place == Place::other && listed) {

@@ -120,9 +120,9 @@ void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_
 
 // Rows of a product, a multiple of kRowPad of them, that need a part of it.
 struct GemmPart {
-  int64_t row, rows;
-  Rows depth;    // where A is not zero
-  Rows columns;  // that anybody reads
+  Range rows;
+  Range depth;    // where A is not zero
+  Range columns;  // that anybody reads
 };
 
 // B packed panel after panel, each [depth][columns of the panel]; initial: a row of start values
@@ -130,11 +130,11 @@ struct GemmPart {
 template <class T>
 void gemm_packed(const GemmPart& part, int64_t width, int64_t depth, const T* a, int64_t lda,
                  const T* packed, T* c, int64_t ldc, const T* initial) {
-  a += part.row * lda + part.depth.begin;
-  c += part.row * ldc;
+  a += part.rows.begin * lda + part.depth.begin;
+  c += part.rows.begin * ldc;
   for_panels<T>(width, [&](int64_t column, int64_t columns) {
     if (column >= part.columns.end || column + columns <= part.columns.begin) return;
-    gemm_panel<T, false, kRowBlock, kRowPad>(columns, part.rows, part.depth.count(), a, lda,
+    gemm_panel<T, false, kRowBlock, kRowPad>(columns, part.rows.count(), part.depth.count(), a, lda,
                                              packed + column * depth + part.depth.begin * columns,
                                              columns, c + column, ldc,
                                              initial != nullptr ? initial + column : nullptr);
@@ -145,7 +145,7 @@ void gemm_packed(const GemmPart& part, int64_t width, int64_t depth, const T* a,
 template <class T>
 void gemm_packed(int64_t rows, int64_t width, int64_t depth, const T* a, int64_t lda,
                  const T* packed, T* c, int64_t ldc, const T* initial) {
-  const GemmPart whole{0, rows, {0, depth}, {0, width}};
+  const GemmPart whole{{0, rows}, {0, depth}, {0, width}};
   gemm_packed<T>(whole, width, depth, a, lda, packed, c, ldc, initial);
 }
 

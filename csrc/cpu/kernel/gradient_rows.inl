@@ -39,7 +39,7 @@ class GradientRows {
   void begin(const Pass& pass, const Pass* previous, const Executor& executor) {
     if (!needed()) return;
     if (in_place_) return clear_in_place(pass, previous, executor);
-    const Rows kept{pass.in.begin, previous != nullptr ? previous->in.end : pass.in.begin};
+    const Range kept{pass.in.begin, previous != nullptr ? previous->in.end : pass.in.begin};
     if (kept.count() > 0) {
       const T* from = memory_.get() + (pass.in.begin - previous->in.begin) * row_elements();
       std::memmove(memory_.get(), from,
@@ -57,7 +57,7 @@ class GradientRows {
   // next: the pass after over the same image, or null. Rows that no pass holds are zero.
   void end(const Pass& pass, bool first, const Pass* next, const Executor& executor) {
     if (!copies()) return;
-    const Rows done{first ? 0 : pass.in.begin, next != nullptr ? next->in.begin : conv_.y.in};
+    const Range done{first ? 0 : pass.in.begin, next != nullptr ? next->in.begin : conv_.y.in};
     const std::vector<T> zeros(static_cast<size_t>(row_elements()), T(0));
     const int64_t rows = pass.images * std::max<int64_t>(done.count(), 0);
     run_tasks(executor, rows, workers_for(executor, rows, rows * row_elements()),

@@ -4,8 +4,8 @@
 // its taps reach across all of it. By shape and scale alone, so that sums keep their order.
 struct Pass {
   int64_t first_image, images;
-  Rows out;
-  Rows in;  // of successive passes over an image neither bound goes back
+  Range out;
+  Range in;  // of successive passes over an image neither bound goes back
 };
 
 // The largest finite magnitude of the scale at `count` flat output pixels: taps of a scale that is
@@ -43,7 +43,7 @@ int64_t spread_of(const Conv& conv, T scale) {
 }
 
 // The input rows within a spread of output rows: both rows around a sample.
-inline Rows rows_around(const Conv& conv, Rows rows, int64_t spread) {
+inline Range rows_around(const Conv& conv, Range rows, int64_t spread) {
   const auto clamp = [&](int64_t row) { return std::min(std::max<int64_t>(row, 0), conv.y.in); };
   return {clamp(conv.y.centre_floor(rows.begin) - spread),
           clamp(conv.y.centre_floor(rows.end - 1) + spread + 2)};
@@ -68,7 +68,7 @@ std::vector<Pass> make_passes(const Conv& conv, const View& scale, bool copies, 
     }
     return passes;
   }
-  std::vector<Rows> reach(static_cast<size_t>(conv.y.out));
+  std::vector<Range> reach(static_cast<size_t>(conv.y.out));
   for (int64_t n = 0; n < conv.batch; ++n) {
     // Rows that one output row needs anyway cost the others no memory: a depth that is far too near
     // must not make a pass of every row that has one.
@@ -82,10 +82,10 @@ std::vector<Pass> make_passes(const Conv& conv, const View& scale, bool copies, 
     const int64_t most_out = (conv.y.out + shares - 1) / shares;
     const size_t start = passes.size();
     for (int64_t y = 0; y < conv.y.out; ++y) {
-      const Rows needed = reach[static_cast<size_t>(y)];
+      const Range needed = reach[static_cast<size_t>(y)];
       if (passes.size() > start) {
         Pass& last = passes.back();
-        const Rows both{std::min(last.in.begin, needed.begin), std::max(last.in.end, needed.end)};
+        const Range both{std::min(last.in.begin, needed.begin), std::max(last.in.end, needed.end)};
         if (both.count() <= most && last.out.count() < most_out) {
           last.in = both;
           last.out.end = y + 1;

@@ -5,7 +5,7 @@ SURFCONV_INLINE bool is_pointwise(const Conv& conv) {
 }
 
 // Outputs of an axis whose centre lies in the image.
-SURFCONV_INLINE Rows outputs_inside(const Axis& axis) {
+SURFCONV_INLINE Range outputs_inside(const Axis& axis) {
   const int64_t begin = std::min((axis.padding + axis.stride - 1) / axis.stride, axis.out);
   const int64_t end = std::min((axis.in - 1 + axis.padding) / axis.stride + 1, axis.out);
   return {begin, std::max(begin, end)};
@@ -122,7 +122,7 @@ class CentrePixels {
 
   View view_;
   int64_t width_;
-  Rows rows_, columns_;
+  Range rows_, columns_;
   bool whole_;         // all centres lie in the image
   bool flat_ = false;  // and the pixels one step apart, in the compute type
 };

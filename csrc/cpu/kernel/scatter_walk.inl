@@ -57,7 +57,7 @@ SURFCONV_INLINE void scatter_place(const ScatterTarget<T>& target, const TapSide
 
 // Whole rows of taps of the interior pixels begin .. end-1.
 template <bool Writes, Slopes S, int K, class T, class Channels>
-void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Range taps_y,
                       ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
                       int64_t ld) {
   using W = typename WeightOf<T, Channels>::type;
@@ -79,7 +79,7 @@ void scatter_interior(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns,
 // Whole rows of taps of the pixels begin .. end-1, which are on the grid: the derivative is the
 // step to the pixel that a tap moves towards.
 template <bool Writes, Slopes S, int K, class T, class Channels>
-void scatter_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+void scatter_grid(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Range taps_y,
                   ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
                   int64_t ld) {
   const Axis axis_y = conv.y, axis_x = conv.x;
@@ -156,7 +156,7 @@ SURFCONV_INLINE void scatter_seen_place(const ScatterTarget<T>& target, const Se
 
 // Whole rows of taps of the pixels begin .. end-1, of which part may lie outside the image.
 template <bool Writes, Slopes S, class T, class Channels>
-void scatter_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Rows taps_y,
+void scatter_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Range taps_y,
                   ScatterTarget<T> target, int begin, int end, Channels channels, T* matrix,
                   int64_t ld) {
   const Axis axis_y = conv.y, axis_x = conv.x;
@@ -178,7 +178,7 @@ void scatter_seen(const Conv& conv, AxisTable<T> rows, AxisTable<T> columns, Row
 template <bool Writes, Slopes S, class T>
 void scatter_tile(const Conv& conv, const Tile<T>& tile, int64_t first_tap, int64_t taps,
                   const ScatterTarget<T>& target, int64_t channels, T* matrix, int64_t ld) {
-  const Rows taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
+  const Range taps_y{first_tap / conv.x.kernel, (first_tap + taps) / conv.x.kernel};
   const bool listed = tile.needs_list();
   tile.for_runs([&](const Run& run) {
     if (run.place == Place::other && listed) {

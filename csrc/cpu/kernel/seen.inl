@@ -33,7 +33,7 @@ SURFCONV_INLINE int see(const Axis& axis, const AxisTable<T>& table, int64_t t, 
 // number from the first.
 template <bool Writes, Slopes S, class T, class Body>
 SURFCONV_INLINE void walk_seen(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
-                               const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
+                               const AxisTable<T>& columns, Range taps_y, int m, const Body& body) {
   using Zero = std::integral_constant<int, 0>;
   SeenSide<T> seen_x[kMostTaps];
   int places_x[kMostTaps];

@@ -11,8 +11,8 @@ struct Run {
 
 // Successive pixels of a tile, whole blocks of a product, that see something of the same taps.
 struct SeenTaps {
-  int begin, end;  // may end beyond the tile's pixels
-  Rows taps;       // whole rows of the kernel
+  Range pixels;  // may end beyond the tile's
+  Range taps;    // whole rows of the kernel
 };
 
 // One worker's view of the tile it is at: the geometry of up to kTile flat output pixels.
@@ -97,27 +97,27 @@ class Tile {
   // What for_seen goes by, of the tile's `count` pixels. Of listed corners nothing is left out.
   void find_seen(int count, bool derivatives) {
     const T* present = derivatives ? rows_.inside : rows_.weight;
-    const int padded = static_cast<int>(round_up(count, kRowPad));
-    seen_[0] = {0, padded, {0, conv_.y.kernel * conv_.x.kernel}};
+    const int64_t padded = round_up(count, kRowPad);
+    seen_[0] = {{0, padded}, {0, conv_.y.kernel * conv_.x.kernel}};
     seen_count_ = 1;
     if (!has(Place::other) || needs_list() || see_rows_between(present)) return;
     seen_count_ = 0;
-    for (int begin = 0; begin < padded; begin += kRowPad) {
-      const int end = std::min(begin + kRowPad, count);
-      Rows rows{0, 0};
+    for (int64_t begin = 0; begin < padded; begin += kRowPad) {
+      const int64_t end = begin + kRowPad, behind = std::min<int64_t>(end, count);
+      Range rows{0, 0};
       for (int64_t t = 0; t < conv_.y.kernel; ++t) {
         const T* lower = present + 2 * t * kTile;
         const T* upper = conv_.y.fixed(t) ? lower : lower + kTile;
         bool some = false;
-        for (int m = begin; m < end; ++m) some |= (lower[m] != 0) | (upper[m] != 0);
+        for (int64_t m = begin; m < behind; ++m) some |= (lower[m] != 0) | (upper[m] != 0);
         if (some) rows = {rows.count() == 0 ? t : rows.begin, t + 1};
       }
-      const Rows taps{rows.begin * conv_.x.kernel, rows.end * conv_.x.kernel};
+      const Range taps{rows.begin * conv_.x.kernel, rows.end * conv_.x.kernel};
       SeenTaps* last = seen_count_ == 0 ? nullptr : &seen_[seen_count_ - 1];
       if (last != nullptr && last->taps.begin == taps.begin && last->taps.end == taps.end) {
-        last->end = begin + kRowPad;
+        last->pixels.end = end;
       } else {
-        seen_[seen_count_++] = {begin, begin + kRowPad, taps};
+        seen_[seen_count_++] = {{begin, end}, taps};
       }
     }
   }
@@ -127,9 +127,9 @@ class Tile {
   template <class Body>
   SURFCONV_INLINE void for_seen(int64_t first_tap, int64_t taps, const Body& body) const {
     for (int i = 0; i < seen_count_; ++i) {
-      const Rows seen = seen_[i].taps;
+      const Range seen = seen_[i].taps;
       const int64_t begin = std::clamp(seen.begin - first_tap, int64_t{0}, taps);
-      body(seen_[i], Rows{begin, std::clamp(seen.end - first_tap, begin, taps)});
+      body(seen_[i].pixels, Range{begin, std::clamp(seen.end - first_tap, begin, taps)});
     }
   }
 

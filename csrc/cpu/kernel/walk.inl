@@ -50,7 +50,7 @@ using Two = std::integral_constant<int, 2>;
 // body(rows of corners, tap along y, number of its first tap) for the rows taps_y of the kernel. K:
 // the size of a square kernel that is walked whole, whose loops are then unrolled, or 0.
 template <int K, class Body>
-SURFCONV_INLINE void walk_rows(const Axis& axis_y, const Axis& axis_x, Rows taps_y,
+SURFCONV_INLINE void walk_rows(const Axis& axis_y, const Axis& axis_x, Range taps_y,
                                const Body& body) {
   if constexpr (K == 3) {
     body(Two{}, 0, 0);
@@ -80,7 +80,7 @@ SURFCONV_INLINE void walk_columns(const Axis& axis_x, const Body& body) {
 // type of the weights.
 template <int K, class W, class T, class Body>
 SURFCONV_INLINE void walk_taps(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
-                               const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
+                               const AxisTable<T>& columns, Range taps_y, int m, const Body& body) {
   walk_rows<K>(axis_y, axis_x, taps_y, [&](auto r, int64_t ty, int64_t t) SURFCONV_INLINED {
     const auto y = tap_side<decltype(r)::value == 2, W>(axis_y, rows, ty, m);
     walk_columns<K>(axis_x, [&](auto c, int64_t tx) SURFCONV_INLINED {
@@ -113,7 +113,7 @@ SURFCONV_INLINE GridSide<T> grid_side(const Axis& axis, const AxisTable<T>& tabl
 // one corner of weight 1, and rows and columns say along which axes it moves with the scale.
 template <int K, class T, class Body>
 SURFCONV_INLINE void walk_grid(const Axis& axis_y, const Axis& axis_x, const AxisTable<T>& rows,
-                               const AxisTable<T>& columns, Rows taps_y, int m, const Body& body) {
+                               const AxisTable<T>& columns, Range taps_y, int m, const Body& body) {
   walk_rows<K>(axis_y, axis_x, taps_y, [&](auto r, int64_t ty, int64_t t) SURFCONV_INLINED {
     const auto y = grid_side<K, decltype(r)::value == 2>(axis_y, rows, ty, m);
     walk_columns<K>(axis_x, [&](auto c, int64_t tx) SURFCONV_INLINED {
@@ -145,7 +145,7 @@ SURFCONV_INLINE Corners<ROWS, COLUMNS, T, W> corners_of(const char* base, const 
 
 // body(K as a constant), see walk_rows.
 template <class Body>
-SURFCONV_INLINE void with_kernel(const Conv& conv, Rows taps_y, const Body& body) {
+SURFCONV_INLINE void with_kernel(const Conv& conv, Range taps_y, const Body& body) {
   if (taps_y.count() == 3 && conv.y.kernel == 3 && conv.x.kernel == 3) {
     return body(std::integral_constant<int, 3>{});
   }

@@ -46,19 +46,19 @@ void run_tasks(const Executor& executor, int64_t tasks, int workers, const Body&
   struct Queue {
     std::atomic<int64_t> next{0};
     int64_t tasks;
-    int64_t some;
+    int64_t at_once;
     const Body* body;
   } queue;
   queue.tasks = tasks;
-  queue.some = std::max<int64_t>(1, tasks / (kHandouts * workers));
+  queue.at_once = std::max<int64_t>(1, tasks / (kHandouts * workers));
   queue.body = &body;
   executor.run(
       workers,
       [](void* context, int worker) {
         Queue& shared = *static_cast<Queue*>(context);
-        const int64_t tasks = shared.tasks, some = shared.some;
-        for (int64_t task; (task = shared.next.fetch_add(some)) < tasks;) {
-          for (const int64_t end = std::min(task + some, tasks); task < end; ++task) {
+        const int64_t tasks = shared.tasks, at_once = shared.at_once;
+        for (int64_t task; (task = shared.next.fetch_add(at_once)) < tasks;) {
+          for (const int64_t end = std::min(task + at_once, tasks); task < end; ++task) {
             (*shared.body)(worker, task);
           }
         }
