@@ -89,7 +89,7 @@ def test_one_gradient_at_a_time(needed: str, layout: str) -> None:
         assert_matches(alone, getattr(expected, needed), needed)
 
 
-@pytest.mark.parametrize("needs", itertools.product([False, True], repeat=4), ids=str)
+@pytest.mark.parametrize("needs", list(itertools.product([False, True], repeat=4)), ids=str)
 def test_every_set_of_gradients(needs: tuple[bool, ...]) -> None:
     problem = make_problem(1, 3, 4)
     grad = torch.randn(problem.output_shape())

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.distributed as dist
 import torch.multiprocessing as mp
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from guided_nets import Probe, frames, sequential
 from helpers import assert_same_bits
+from ranks import rank_of_two
 from surfconv_ops import DepthGuided, SurfConv2d, ambient, convert_conv2d
 
 
@@ -244,16 +244,13 @@ def build() -> DepthGuided:
 
 
 def train(rank: int, folder: str) -> None:
-    torch.set_num_threads(1)
-    store = f"file://{folder}/store"
-    dist.init_process_group("gloo", init_method=store, rank=rank, world_size=2)
-    net = nn.parallel.DistributedDataParallel(build())
-    torch.manual_seed(5)
-    x, depth = (part[2 * rank : 2 * rank + 2] for part in frames(4))
-    net(x, depth=depth).square().mean().backward()
-    grads = {name: p.grad for name, p in net.module.named_parameters()}
-    torch.save(grads, Path(folder) / f"{rank}.pt")
-    dist.destroy_process_group()
+    with rank_of_two(rank, folder):
+        net = nn.parallel.DistributedDataParallel(build())
+        torch.manual_seed(5)
+        x, depth = (part[2 * rank : 2 * rank + 2] for part in frames(4))
+        net(x, depth=depth).square().mean().backward()
+        grads = {name: p.grad for name, p in net.module.named_parameters()}
+        torch.save(grads, Path(folder) / f"{rank}.pt")
 
 
 def test_two_processes_have_the_gradients_of_one(tmp_path: Path) -> None:

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 import torch
-import torch.distributed as dist
 import torch.multiprocessing as mp
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 from helpers import assert_same_bits, make_problem
+from ranks import rank_of_two
 from surfconv_ops import SurfConv2d, surf_conv2d
 
 
@@ -118,19 +118,16 @@ def batch() -> tuple[Tensor, Tensor]:
 
 
 def train(rank: int, folder: str) -> None:
-    torch.set_num_threads(1)
-    store = f"file://{folder}/store"
-    dist.init_process_group("gloo", init_method=store, rank=rank, world_size=2)
-    torch.manual_seed(7)
-    net = nn.parallel.DistributedDataParallel(Net())
-    optimizer = torch.optim.SGD(net.parameters(), 0.05)
-    x, depth = (part[2 * rank : 2 * rank + 2] for part in batch())
-    for _ in range(3):
-        optimizer.zero_grad()
-        net(x, depth).square().mean().backward()
-        optimizer.step()
-    torch.save(net.module.state_dict(), Path(folder) / f"{rank}.pt")
-    dist.destroy_process_group()
+    with rank_of_two(rank, folder):
+        torch.manual_seed(7)
+        net = nn.parallel.DistributedDataParallel(Net())
+        optimizer = torch.optim.SGD(net.parameters(), 0.05)
+        x, depth = (part[2 * rank : 2 * rank + 2] for part in batch())
+        for _ in range(3):
+            optimizer.zero_grad()
+            net(x, depth).square().mean().backward()
+            optimizer.step()
+        torch.save(net.module.state_dict(), Path(folder) / f"{rank}.pt")
 
 
 def test_two_processes_train_as_one(tmp_path: Path) -> None:
