@@ -20,6 +20,15 @@ CASES: list[dict[str, Any]] = [
     {"batch": 5, "channels": 3, "out_channels": 4, "size": (11, 90), "axes": 2, "guide": "levels"},
     {"channels": 16, "out_channels": 16, "size": (64, 80), "kernel": 5, "padding": 2},
 ]
+# Fewer tiles than threads, whose outputs are shared among them.
+SMALL_MAPS: list[dict[str, Any]] = [
+    {"channels": 72, "out_channels": 201, "size": (5, 7)},
+    {"channels": 64, "out_channels": 128, "size": (8, 9), "guide": "depth", "guide_tolerance": 1.0},
+    {"channels": 96, "out_channels": 150, "size": (7, 7), "groups": 3},
+    {"channels": 130, "out_channels": 202, "size": (7, 7), "kernel": 1, "padding": 0},
+    {"channels": 128, "out_channels": 256, "size": (4, 12), "kernel": 1, "padding": 0},
+    {"channels": 120, "out_channels": 165, "size": (5, 7), "groups": 3, "kernel": 1, "padding": 0},
+]
 
 
 def results(problem: Problem, grad: Tensor, threads: int) -> dict[str, Tensor]:
@@ -27,7 +36,7 @@ def results(problem: Problem, grad: Tensor, threads: int) -> dict[str, Tensor]:
     return problem.gradients(surf_conv2d, grad) | {"output": problem.run(surf_conv2d)}
 
 
-@pytest.mark.parametrize("case", CASES, ids=name_of)
+@pytest.mark.parametrize("case", CASES + SMALL_MAPS, ids=name_of)
 @pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 def test_threads_and_runs(case: dict[str, Any], layout: str, dtype: torch.dtype) -> None:

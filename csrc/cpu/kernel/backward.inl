@@ -36,7 +36,7 @@ class Backward {
       partials = std::max(partials, slots.back().back().partial + 1);
     }
     partials_ = Buffer<T>(partials * partial_elements());
-    clear_partials(partials);
+    clear_partials(executor_, partials_.get(), partials, partial_elements());
     for (size_t i = 0; i < passes.size(); ++i) {
       const Pass& pass = passes[i];
       const auto same_image = [&](size_t other) {
@@ -71,12 +71,6 @@ class Backward {
         1, std::min(kTasks / units(), map / std::max<int64_t>(1, weight_elements_)));
   }
   int64_t partial_elements() const { return weight_elements_ + tile_.bias_elements(); }
-
-  void clear_partials(int64_t count) {
-    const int64_t elements = partial_elements();
-    run_tasks(executor_, count, workers_for(executor_, count, count * elements / 4),
-              [&](int, int64_t i) { std::fill_n(partials_.get() + i * elements, elements, T(0)); });
-  }
 
   void run_slots(const Pass& pass, const std::vector<Slot>& slots) {
     const Plan& plan = tile_.plan();
@@ -188,18 +182,8 @@ class Backward {
   }
 
   void store_weights(int64_t count) {
-    T* const partials = partials_.get();
-    const int64_t elements = partial_elements();
-    constexpr int64_t kSpan = 4096;
-    const int64_t tasks = (elements + kSpan - 1) / kSpan;
-    run_tasks(executor_, tasks, workers_for(executor_, tasks, count * elements / 4),
-              [&](int, int64_t task) {
-                const int64_t begin = task * kSpan, end = std::min(elements, begin + kSpan);
-                for (int64_t k = 1; k < count; ++k) {
-                  const T* from = partials + k * elements;
-                  for (int64_t i = begin; i < end; ++i) partials[i] += from[i];
-                }
-              });
+    const T* const partials = partials_.get();
+    add_partials(executor_, partials_.get(), count, partial_elements());
     if (tensors_.grad_bias.data != nullptr) {
       visit_storage<T>(tensors_.grad_bias, [&](auto* to) {
         for (int64_t o = 0; o < conv_.out_channels; ++o) {

@@ -69,11 +69,7 @@ class BackwardTile {
       }
       return;
     }
-    const auto store_run = [&](const WeightRun& run) {
-      store_pixels<T>(run.view, 0, first, plan_.outputs, run.width, run.first, run.count,
-                      from + run.row * width_, run.step * width_);
-    };
-    for_weight_runs(to, conv_.x.kernel, block, 0, plan_.taps, block.padded, store_run);
+    store_weight_rows(from, width_, conv_.x.kernel, plan_, block, to);
   }
 
   void pack_weights(const Executor& executor) {

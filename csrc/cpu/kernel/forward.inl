@@ -1,5 +1,12 @@
 // Forward: for each tile of output pixels the corners once, then for each block of taps and
 // channels a gathered matrix that stays in cache and its product with the packed weights.
+
+// Outputs of a tile that are one task.
+struct Outputs {
+  Range groups;
+  Range channels;  // of each group
+};
+
 template <class T>
 class Forward {
  public:
@@ -32,8 +39,8 @@ class Forward {
     input_.reserve(passes);
     const int64_t work = conv_.x.out * plan_.taps * plan_.channels * conv_.out_channels;
     const int64_t most_tiles = (conv_.y.out * conv_.x.out + kTile - 1) / kTile;
-    const int workers =
-        workers_for(executor_, passes[0].images * most_tiles, conv_.y.out * conv_.batch * work);
+    const int workers = workers_for(executor_, passes[0].images * most_tiles * pieces(),
+                                    conv_.y.out * conv_.batch * work);
     const int64_t need = Tile<T>::need(conv_, taps_) + Workspace::need<T>(kTile * ld_rows_) +
                          Workspace::need<T>(kTile * plan_.groups * width_) +
                          (fused_ ? LaneScratch<T>::need(conv_) : 0);
@@ -50,13 +57,16 @@ class Forward {
     for (const Pass& pass : passes) {
       input_.pack(pass, executor_);
       guide_.pack(pass.first_image, pass.images, executor_);
-      const int64_t first = pass.out.begin * conv_.x.out;
-      const int64_t pixels = pass.out.count() * conv_.x.out, tiles = (pixels + kTile - 1) / kTile;
-      run_tasks(executor_, pass.images * tiles, workers, [&](int worker, int64_t task) {
-        const int64_t done = task % tiles * kTile;
-        tile(scratch[static_cast<size_t>(worker)], pass, pass.first_image + task / tiles,
-             first + done, static_cast<int>(std::min<int64_t>(kTile, pixels - done)));
-      });
+      const int64_t first = pass.out.begin * conv_.x.out, pixels = pass.out.count() * conv_.x.out;
+      const int64_t tiles = (pixels + kTile - 1) / kTile;
+      const Shares shares(pass.images * whole_tiles(pixels, kTile), pieces(), piece(), workers);
+      run_tasks(
+          executor_, pass.images * tiles * shares.count(), workers, [&](int worker, int64_t task) {
+            const int64_t of_all = task / shares.count(), done = of_all % tiles * kTile;
+            tile(scratch[static_cast<size_t>(worker)], pass, pass.first_image + of_all / tiles,
+                 first + done, static_cast<int>(std::min<int64_t>(kTile, pixels - done)),
+                 outputs_of(shares.pieces(task % shares.count())));
+          });
     }
   }
 
@@ -67,6 +77,17 @@ class Forward {
     T* out;   // [kTile][groups * width]
     LaneScratch<T> lanes;
   };
+
+  // What the outputs of a tile may be cut into, for products: groups, or panels of the only one.
+  int64_t pieces() const {
+    if (plan_.lanewise || few_) return 1;
+    return plan_.groups > 1 ? plan_.groups : (plan_.outputs + piece() - 1) / piece();
+  }
+  int64_t piece() const { return plan_.groups > 1 ? plan_.outputs : 2 * kLanes<T>; }
+  Outputs outputs_of(Range pieces) const {
+    if (plan_.lanewise || few_ || plan_.groups > 1) return {pieces, {0, plan_.outputs}};
+    return {{0, 1}, {pieces.begin * piece(), std::min(pieces.end * piece(), plan_.outputs)}};
+  }
 
   // Where the packed weights of a block of taps and channels start.
   T* packed(const ChannelBlock& block, int64_t first_tap, int64_t taps) {
@@ -115,7 +136,8 @@ class Forward {
               });
   }
 
-  void tile(Scratch& scratch, const Pass& pass, int64_t n, int64_t begin, int count) {
+  void tile(Scratch& scratch, const Pass& pass, int64_t n, int64_t begin, int count,
+            const Outputs& outputs) {
     constexpr int64_t bytes = sizeof(T);
     const char* base = input_.image(pass, n);
     const int64_t unseen = byte_distance(base, unseen_.data());
@@ -164,6 +186,7 @@ class Forward {
         scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
       }
       for (const ChannelBlock& block : blocks_) {
+        if (!outputs.groups.has(block.group)) continue;
         const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
         // What pads the channels costs the product nothing.
         const int64_t step = plan_.lanewise ? block.padded : block.count;
@@ -178,7 +201,7 @@ class Forward {
           T* to = out + block.group * group_step;
           const T* initial = first ? initial_.data() + block.group * width_ : nullptr;
           scratch.tile.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
-            const GemmPart part{pixels, {seen.begin * step, seen.end * step}, {0, plan_.outputs}};
+            const GemmPart part{pixels, {seen.begin * step, seen.end * step}, outputs.channels};
             gemm_packed<T>(part, plan_.outputs, taps * step, scratch.rows, ld_rows_, weights, to,
                            ld_out, initial);
           });
@@ -192,9 +215,11 @@ class Forward {
                        count, scratch.out + j * plan_.row, ld_out);
       }
     } else {
-      for (int64_t g = 0; g < plan_.groups; ++g) {
-        store_pixels<T>(tensors_.output, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin,
-                        count, scratch.out + g * width_, ld_out);
+      for (int64_t g = outputs.groups.begin; g < outputs.groups.end; ++g) {
+        const Range channels = outputs.channels;
+        store_pixels<T>(tensors_.output, n, g * plan_.outputs + channels.begin, channels.count(),
+                        conv_.x.out, begin, count, scratch.out + g * width_ + channels.begin,
+                        ld_out);
       }
     }
   }

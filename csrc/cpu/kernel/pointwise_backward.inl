@@ -19,9 +19,10 @@ class PointwiseBackward {
         zeros_(static_cast<size_t>(std::max<int64_t>(conv.in_channels, kPlaneTile) + 2 * kLanes<T>),
                T(0)) {
     for (const Unit& unit : units_) {
+      offsets_.push_back({packed_, partial_});
       for (const ChannelBlock& block : unit.blocks) {
-        partial_ += weight_elements(block);
         packed_ += packed_elements(block);
+        partial_ += weight_elements(block);
       }
     }
   }
@@ -35,7 +36,7 @@ class PointwiseBackward {
         std::max<int64_t>(1, std::min(std::max<int64_t>(1, kTasks / units), total / kLeastTiles));
     const int64_t elements = partial_ + conv_.out_channels;
     partials_ = Buffer<T>(slots * elements);
-    std::fill_n(partials_.get(), slots * elements, T(0));
+    clear_partials(executor_, partials_.get(), slots, elements);
     const int workers = workers_for(executor_, slots * units,
                                     conv_.batch * pixels * plan_.channels * conv_.out_channels);
     Workspace memory(workers * need());
@@ -50,12 +51,16 @@ class PointwiseBackward {
              std::min<int64_t>(kTile, pixels - begin));
       }
     });
-    store(slots, elements);
+    add_partials(executor_, partials_.get(), slots, elements);
+    store();
   }
 
  private:
   static constexpr int64_t kTasks = 32, kLeastTiles = 32;
 
+  struct Offsets {
+    int64_t filters, weight;
+  };
   struct Scratch {
     T* grad_out;  // rows: [group][kTile][width]; planes: [width][kTile]
     T* in;        // [kTile][ld_in]
@@ -120,37 +125,34 @@ class PointwiseBackward {
 
   void pack() {
     filters_ = Buffer<T>(packed_);
-    T* to = filters_.get();
-    const View& weight = tensors_.weight;
-    for (const Unit& unit : units_) {
+    for_units(packed_, [&](const Unit& unit, Offsets offsets) {
+      T* to = filters_.get() + offsets.filters;
       for (const ChannelBlock& block : unit.blocks) {
         if (planar_) {
-          visit_storage<T>(weight, [&](auto* data) {
-            const auto* filters =
-                data + block.group * plan_.outputs * weight.n + block.first * weight.c;
-            const auto left = [&](int64_t c, int64_t o) {
-              return widen(filters[o * weight.n + c * weight.c]);
-            };
-            pack_rows(round_up(block.count, 4), block.count, plan_.outputs, left, to);
-          });
+          View filters = output_pixels(tensors_.weight);
+          advance(filters, block.group * plan_.outputs * filters.x);
+          pack_rows(filters, block.first, block.count, plan_.outputs, to);
         } else {
-          pack_backward(weight, 1, plan_, block, 0, 1, to);
+          pack_backward(tensors_.weight, 1, plan_, block, 0, 1, to);
         }
         to += packed_elements(block);
       }
-    }
+    });
+  }
+
+  // body(unit, where its packed filters and its grad_weight begin)
+  template <class Body>
+  void for_units(int64_t work, const Body& body) const {
+    const int64_t units = static_cast<int64_t>(units_.size());
+    run_tasks(executor_, units, workers_for(executor_, units, work), [&](int, int64_t unit) {
+      body(units_[static_cast<size_t>(unit)], offsets_[static_cast<size_t>(unit)]);
+    });
   }
 
   void tile(Scratch& scratch, int64_t index, T* partial, int64_t n, int64_t begin,
             int64_t count) const {
-    const T* filters = filters_.get();
-    T* weight = partial;
-    for (int64_t i = 0; i < index; ++i) {
-      for (const ChannelBlock& block : units_[static_cast<size_t>(i)].blocks) {
-        filters += packed_elements(block);
-        weight += weight_elements(block);
-      }
-    }
+    const T* filters = filters_.get() + offsets_[static_cast<size_t>(index)].filters;
+    T* weight = partial + offsets_[static_cast<size_t>(index)].weight;
     const Unit& unit = units_[static_cast<size_t>(index)];
     T* bias = tensors_.grad_bias.data != nullptr ? partial + partial_ : nullptr;
     if (!planar_) {
@@ -249,7 +251,8 @@ class PointwiseBackward {
       const bool direct = to != nullptr;
       const int64_t ld = direct ? grad_input_.plane_step() : kPlaneTile;
       if (!direct) to = scratch.grad_in;
-      multiply_planes<T>(padded, plan_.outputs, filters, grad, ld_grad, to, ld, zeros_.data());
+      multiply_planes<T>(padded, count, plan_.outputs, filters, grad, ld_grad, to, ld,
+                         zeros_.data());
       if (!direct) grad_input_.store_planes(n, channel, block.count, begin, count, to, ld);
     }
     if (tensors_.grad_weight.data == nullptr) return;
@@ -269,12 +272,8 @@ class PointwiseBackward {
     }
   }
 
-  void store(int64_t slots, int64_t elements) {
-    T* const sums = partials_.get();
-    for (int64_t slot = 1; slot < slots; ++slot) {
-      const T* from = sums + slot * elements;
-      for (int64_t i = 0; i < elements; ++i) sums[i] += from[i];
-    }
+  void store() const {
+    const T* const sums = partials_.get();
     if (tensors_.grad_bias.data != nullptr) {
       visit_storage<T>(tensors_.grad_bias, [&](auto* to) {
         for (int64_t o = 0; o < conv_.out_channels; ++o) {
@@ -283,20 +282,19 @@ class PointwiseBackward {
       });
     }
     if (tensors_.grad_weight.data == nullptr) return;
-    const View& to = tensors_.grad_weight;
-    visit_storage<T>(to, [&](auto* data) {
-      const T* from = sums;
-      for (const Unit& unit : units_) {
-        for (const ChannelBlock& block : unit.blocks) {
-          const int64_t columns = pad_width<T>(block.count);
-          for (int64_t c = 0; c < block.count; ++c) {
-            for (int64_t o = 0; o < plan_.outputs; ++o) {
-              narrow(from[planar_ ? o * columns + c : c * width_ + o],
-                     data + (block.group * plan_.outputs + o) * to.n + (block.first + c) * to.c);
-            }
-          }
-          from += weight_elements(block);
+    for_units(partial_, [&](const Unit& unit, Offsets offsets) {
+      const T* from = sums + offsets.weight;
+      for (const ChannelBlock& block : unit.blocks) {
+        const int64_t first = block.group * plan_.outputs;
+        if (planar_) {
+          store_pixels<T>(output_pixels(tensors_.grad_weight), 0, block.first, block.count,
+                          conv_.out_channels, first, plan_.outputs, from,
+                          pad_width<T>(block.count));
+        } else {
+          store_pixels<T>(input_pixels(tensors_.grad_weight), 0, first, plan_.outputs,
+                          plan_.channels, block.first, block.count, from, width_);
         }
+        from += weight_elements(block);
       }
     });
   }
@@ -307,6 +305,7 @@ class PointwiseBackward {
   const Plan plan_;
   const bool planar_;
   const std::vector<Unit> units_;
+  std::vector<Offsets> offsets_;  // of each unit
   const OutputGradient<T> output_;
   const CentrePixels<T> grad_output_, input_, grad_input_;
   const int64_t width_;  // outputs of a group, padded

@@ -142,28 +142,41 @@ SURFCONV_INLINE int64_t row_block(int64_t rows_left) {
   return rows_left >= kRowBlock ? kRowBlock : 4;
 }
 
-// packed: [block of rows][depth][rows of the block], of left(row, k); rows a multiple of four.
-template <class T, class Left>
-void pack_rows(int64_t rows, int64_t used, int64_t depth, const Left& left, T* packed) {
+// Filters of one tap as a row of pixels: an input channel's with the outputs for channels, or an
+// output's with the input's.
+SURFCONV_INLINE View input_pixels(View weight) {
+  weight.x = weight.c;
+  weight.c = weight.n;
+  return weight;
+}
+SURFCONV_INLINE View output_pixels(View weight) {
+  weight.x = weight.n;
+  return weight;
+}
+
+// packed: [block of rows][depth][rows of the block], zeros up to a multiple of four rows. filters:
+// rows are its channels, the depth its pixels.
+template <class T>
+void pack_rows(const View& filters, int64_t first, int64_t rows, int64_t depth, T* packed) {
   for (int64_t row = 0, block; row < rows; row += block) {
-    block = row_block(rows - row);
-    for (int64_t k = 0; k < depth; ++k) {
-      for (int64_t r = row; r < row + block; ++r) *packed++ = r < used ? left(r, k) : T(0);
-    }
+    block = row_block(round_up(rows, 4) - row);
+    load_pixels<T>(filters, 0, first + row, std::min(block, rows - row), depth, 0, depth,
+                   packed + row * depth, block, block);
   }
 }
 
-// C[rows x kPlaneTile] = initial row (null: C) + packed rows * B[depth][ldb].
+// C[rows x columns] = initial row (null: C) + packed rows * B[depth][ldb]; columns are padded to
+// whole panels, of which kPlaneTile has room for.
 template <class T>
-void multiply_planes(int64_t rows, int64_t depth, const T* packed, const T* b, int64_t ldb, T* c,
-                     int64_t ldc, const T* initial) {
+void multiply_planes(int64_t rows, int64_t columns, int64_t depth, const T* packed, const T* b,
+                     int64_t ldb, T* c, int64_t ldc, const T* initial) {
   for (int64_t row = 0, block; row < rows; row += block) {
     block = row_block(rows - row);
-    for_panels<T>(kPlaneTile, [&](int64_t column, int64_t columns) {
+    for_panels<T>(columns, [&](int64_t column, int64_t panel) {
       const auto multiply = [&](auto most) {
-        gemm_panel<T, true, decltype(most)::value>(columns, block, depth, packed + row * depth,
-                                                   block, b + column, ldb, c + row * ldc + column,
-                                                   ldc, initial);
+        gemm_panel<T, true, decltype(most)::value>(panel, block, depth, packed + row * depth, block,
+                                                   b + column, ldb, c + row * ldc + column, ldc,
+                                                   initial);
       };
       block == 4 ? multiply(std::integral_constant<int, 4>{})
                  : multiply(std::integral_constant<int, kRowBlock>{});

@@ -12,14 +12,16 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "gemm.inl"
 #include "lanewise.inl"
 #include "blocks.inl"
+#include "weights.inl"
 #include "passes.inl"
 #include "walk.inl"
 #include "seen.inl"
 #include "gather.inl"
 #include "lane_forward.inl"
 #include "few_forward.inl"
+#include "shares.inl"
 #include "pointwise_pixels.inl"
-#include "pointwise.inl"
+#include "pointwise_forward.inl"
 #include "forward.inl"
 
 }  // namespace surfconv::cpu::SURFCONV_ISA

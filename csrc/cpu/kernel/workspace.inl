@@ -38,29 +38,28 @@ class Workspace {
   char* next_;
 };
 
-// Hands task numbers to the workers, some at a time: neighbours share what they read, and the
-// counter goes to and fro less often. Which worker runs a task changes no result.
+// Hands task numbers to the workers, many at first, for neighbours share what they read and write,
+// then fewer, so that all end together. Which worker runs a task changes no result.
 template <class Body>
 void run_tasks(const Executor& executor, int64_t tasks, int workers, const Body& body) {
-  constexpr int64_t kHandouts = 64;  // to a worker, so that all end together
   struct Queue {
     std::atomic<int64_t> next{0};
-    int64_t tasks;
-    int64_t at_once;
+    int64_t tasks, shares;
     const Body* body;
   } queue;
   queue.tasks = tasks;
-  queue.at_once = std::max<int64_t>(1, tasks / (kHandouts * workers));
+  queue.shares = int64_t{4} * workers;  // of what is left
   queue.body = &body;
   executor.run(
       workers,
       [](void* context, int worker) {
         Queue& shared = *static_cast<Queue*>(context);
-        const int64_t tasks = shared.tasks, at_once = shared.at_once;
-        for (int64_t task; (task = shared.next.fetch_add(at_once)) < tasks;) {
-          for (const int64_t end = std::min(task + at_once, tasks); task < end; ++task) {
-            (*shared.body)(worker, task);
-          }
+        const int64_t tasks = shared.tasks;
+        for (int64_t task = shared.next.load(); task < tasks;) {
+          const int64_t end = task + std::max<int64_t>(1, (tasks - task) / shared.shares);
+          if (!shared.next.compare_exchange_weak(task, end)) continue;
+          for (; task < end; ++task) (*shared.body)(worker, task);
+          task = shared.next.load();
         }
       },
       &queue);
