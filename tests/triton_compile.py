@@ -132,7 +132,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--full", action="store_true", help="every tile size and more layers")
     full = parser.parse_args().full
-    for capability in (80, 90) if full else (90,):
+    for capability in (80, 86, 90) if full else (86, 90):
         for kernel, one, options in jobs(full):
             torch.backends.cuda.matmul.allow_tf32 = options["tf32"]
             for cut in CUTS[kernel](one)[: None if full else 1]:

@@ -101,21 +101,6 @@ class WholeFilters {
   const bool are_;
 };
 
-// The run after this one, `step` elements on, of the outputs first .. first+outputs-1: too short for
-// the processor to see it coming.
-template <class T>
-void fetch_run(const WeightRun& run, int64_t first, int64_t outputs, int64_t step) {
-  constexpr int64_t kLine = 64, bytes = sizeof(T);
-  if (run.view.dtype != kComputeDType<T>) return;
-  const uintptr_t start = reinterpret_cast<uintptr_t>(run.view.data);
-  for (int64_t o = first; o < first + outputs; ++o) {
-    const uintptr_t row = start + static_cast<uintptr_t>((o * run.view.c + step) * bytes);
-    for (int64_t at = 0; at < run.count * bytes; at += kLine) {
-      prefetch(row + static_cast<uintptr_t>(at));
-    }
-  }
-}
-
 // Rows (tap, channel) of a block against its group's outputs, in panels: the forward's B.
 template <class T>
 void pack_forward(const View& weight, int64_t kernel_x, const Plan& plan, const ChannelBlock& block,
@@ -127,7 +112,6 @@ void pack_forward(const View& weight, int64_t kernel_x, const Plan& plan, const 
     const int64_t first = block.group * plan.outputs + column;
     if (whole) return whole.load(first, used, panel, columns);
     const auto load_run = [&](const WeightRun& run) {
-      if (run.step == 1) fetch_run<T>(run, first, used, weight.x);
       load_pixels<T>(run.view, 0, first, used, run.width, run.first, run.count,
                      panel + run.row * columns, run.step * columns, columns);
     };
