@@ -62,8 +62,8 @@ if SANITIZE:
 else:
     # The kernels read neither errno nor the exception flags; saying so lets loops vectorise.
     COMPILE_FLAGS += ["-O3", "-fno-math-errno", "-fno-trapping-math"]
-    # Where loops lie in cache lines, worth 2 % of a backward, is then no matter of luck.
-    COMPILE_FLAGS += ["-falign-functions=64"]
+    # Where loops lie in cache lines, worth 7 % of a product, is then no matter of luck.
+    COMPILE_FLAGS += ["-falign-functions=64", "-falign-loops=64"]
     LINK_FLAGS += ["-Wl,-z,defs"]
 
 

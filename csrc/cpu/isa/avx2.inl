@@ -10,8 +10,7 @@
 #define SURFCONV_ISA avx2_isa
 #define SURFCONV_VECTOR_BYTES 32
 #define SURFCONV_GEMM_ROWS 6
-#define SURFCONV_GEMM_NARROW_ROWS 12
-#define SURFCONV_GEMM_NARROW_STEPS 1
+#define SURFCONV_GEMM_FETCHES false
 #include SURFCONV_UNIT
 
 #pragma GCC pop_options

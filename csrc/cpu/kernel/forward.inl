@@ -180,6 +180,11 @@ class Forward {
       });
     }
     if (gathers && !plan_.lanewise) scratch.tile.find_seen(count, false);
+    if (!direct && !plan_.lanewise) {
+      for_stored(outputs, [&](int64_t channel, int64_t channels, int64_t) SURFCONV_INLINED {
+        fetch_to_store<T>(tensors_.output, n, channel, channels, conv_.x.out, begin, count);
+      });
+    }
     for (int64_t first_tap = 0; gathers && first_tap < plan_.taps; first_tap += taps_) {
       const int64_t taps = std::min(taps_, plan_.taps - first_tap);
       if (scratch.tile.needs_list()) {
@@ -215,12 +220,19 @@ class Forward {
                        count, scratch.out + j * plan_.row, ld_out);
       }
     } else {
-      for (int64_t g = outputs.groups.begin; g < outputs.groups.end; ++g) {
-        const Range channels = outputs.channels;
-        store_pixels<T>(tensors_.output, n, g * plan_.outputs + channels.begin, channels.count(),
-                        conv_.x.out, begin, count, scratch.out + g * width_ + channels.begin,
-                        ld_out);
-      }
+      for_stored(outputs, [&](int64_t channel, int64_t channels, int64_t at) SURFCONV_INLINED {
+        store_pixels<T>(tensors_.output, n, channel, channels, conv_.x.out, begin, count,
+                        scratch.out + at, ld_out);
+      });
+    }
+  }
+
+  // body(first channel of the output, channels, where the product has them), group by group
+  template <class Body>
+  SURFCONV_INLINE void for_stored(const Outputs& outputs, const Body& body) const {
+    const Range channels = outputs.channels;
+    for (int64_t g = outputs.groups.begin; g < outputs.groups.end; ++g) {
+      body(g * plan_.outputs + channels.begin, channels.count(), g * width_ + channels.begin);
     }
   }
 

@@ -2,54 +2,87 @@
 // Accumulators are named variables: arrays of vectors spill under g++ 12.
 #define SURFCONV_ROWS(X) X(0) X(1) X(2) X(3) X(4) X(5) X(6) X(7) X(8) X(9) X(10) X(11)
 
-// A[row, k] at a[row * lda + k], or with TransposedA at a[row + k * lda]. STEPS of the depth at
-// once, so that where a row of A begins, which may not stay in a register, is read once for all of
-// them.
-template <class T, int ROWS, int VECTORS, int L, bool TransposedA, int STEPS>
+// Where the rows of a block are. Six pointers stay in registers; of twelve some would not, and g++
+// makes them of any sum it can see through.
+template <class T, int ROWS>
+class BlockRows {
+ public:
+  BlockRows(T* first, int64_t ld)
+      : fours_{first, first + 4 * ld, first + 8 * ld}, step_(ld), three_(3 * ld) {
+#if defined(SURFCONV_X86)
+    if (!kPlain) asm("" : "+r"(fours_[1]), "+r"(fours_[2]), "+r"(three_));
+#endif
+  }
+  template <int R>
+  SURFCONV_INLINE T* at() const {
+    if (kPlain) return fours_[0] + R * step_;
+    return fours_[R / 4] + (R % 4 == 3 ? three_ : R % 4 * step_);
+  }
+  SURFCONV_INLINE void advance(int64_t elements) {
+    for (T*& four : fours_) four += elements;
+  }
+
+ private:
+  static constexpr bool kPlain = ROWS <= 6;
+
+  T* fours_[3];
+  const int64_t step_;
+  int64_t three_;
+};
+// Those of a matrix that lies transposed.
+template <class T>
+class BlockColumns {
+ public:
+  BlockColumns(T* first, int64_t) : first_(first) {}
+  template <int R>
+  SURFCONV_INLINE T* at() const {
+    return first_ + R;
+  }
+  SURFCONV_INLINE void advance(int64_t elements) { first_ += elements; }
+
+ private:
+  T* first_;
+};
+
+// A[row, k] at a[row * lda + k], or with TransposedA at a[row + k * lda]; depth is not 0. FETCHED:
+// bytes that each step of the depth fetches of what lies at `ahead`.
+template <class T, int ROWS, int VECTORS, int L, bool TransposedA, int FETCHED>
 SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t lda,
                                 const T* __restrict b, int64_t ldb, T* __restrict c, int64_t ldc,
-                                const T* initial) {
+                                const T* initial, uintptr_t ahead) {
   using V = Vec<T, L>;
-  const int64_t row_step = TransposedA ? 1 : lda;
   const int64_t depth_step = TransposedA ? lda : 1;
-#define SURFCONV_LOAD(R)                                        \
-  V left##R{}, right##R{};                                      \
-  if constexpr (R < ROWS) {                                     \
-    const T* from = initial != nullptr ? initial : c + R * ldc; \
-    left##R = load<V>(from);                                    \
-    if constexpr (VECTORS > 1) right##R = load<V>(from + L);    \
+  std::conditional_t<TransposedA, BlockColumns<const T>, BlockRows<const T, ROWS>> rows(a, lda);
+  const BlockRows<T, ROWS> out(c, ldc);
+#define SURFCONV_LOAD(R)                                                 \
+  V left##R{}, right##R{};                                               \
+  if constexpr (R < ROWS) {                                              \
+    const T* from = initial != nullptr ? initial : out.template at<R>(); \
+    left##R = load<V>(from);                                             \
+    if constexpr (VECTORS > 1) right##R = load<V>(from + L);             \
   }
   SURFCONV_ROWS(SURFCONV_LOAD)
-  const auto advance = [&](auto steps) SURFCONV_INLINED {
-    constexpr int N = decltype(steps)::value;
-    V b0[N], b1[N];
-#pragma GCC unroll 4
-    for (int i = 0; i < N; ++i) {
-      b0[i] = load<V>(b + i * ldb);
-      if constexpr (VECTORS > 1) b1[i] = load<V>(b + i * ldb + L);
+  do {  // a loop that may be passed over has g++ move all sums where it ends
+    const V b0 = load<V>(b), b1 = VECTORS > 1 ? load<V>(b + (VECTORS - 1) * L) : V{};
+    if constexpr (FETCHED > 0) {
+      prefetch(ahead);
+      ahead += FETCHED;
     }
-#define SURFCONV_FMA(R)                                     \
-  if constexpr (R < ROWS) {                                 \
-    const T* row = a + R * row_step;                        \
-    _Pragma("GCC unroll 4") for (int i = 0; i < N; ++i) {   \
-      const T value = row[i * depth_step];                  \
-      left##R += value * b0[i];                             \
-      if constexpr (VECTORS > 1) right##R += value * b1[i]; \
-    }                                                       \
+#define SURFCONV_FMA(R)                                \
+  if constexpr (R < ROWS) {                            \
+    const T value = *rows.template at<R>();            \
+    left##R += value * b0;                             \
+    if constexpr (VECTORS > 1) right##R += value * b1; \
   }
     SURFCONV_ROWS(SURFCONV_FMA)
-    a += N * depth_step;
-    b += N * ldb;
-  };
-  int64_t k = 0;
-  for (; k + STEPS <= depth; k += STEPS) advance(std::integral_constant<int, STEPS>{});
-  if constexpr (STEPS > 1) {
-    for (; k < depth; ++k) advance(std::integral_constant<int, 1>{});
-  }
-#define SURFCONV_STORE(R)                                        \
-  if constexpr (R < ROWS) {                                      \
-    store(c + R * ldc, left##R);                                 \
-    if constexpr (VECTORS > 1) store(c + R * ldc + L, right##R); \
+    rows.advance(depth_step);
+    b += ldb;
+  } while (--depth > 0);
+#define SURFCONV_STORE(R)                               \
+  if constexpr (R < ROWS) {                             \
+    T* to = out.template at<R>();                       \
+    store(to, left##R);                                 \
+    if constexpr (VECTORS > 1) store(to + L, right##R); \
   }
   SURFCONV_ROWS(SURFCONV_STORE)
 #undef SURFCONV_LOAD
@@ -58,7 +91,7 @@ SURFCONV_INLINE void gemm_block(int64_t depth, const T* __restrict a, int64_t ld
 }
 
 constexpr int kRowBlock = 12;  // rows of the largest block
-static_assert(kRowPad % SURFCONV_GEMM_ROWS == 0 && kRowBlock % kRowPad == 0, "whole blocks only");
+static_assert(kRowBlock % SURFCONV_GEMM_ROWS == 0 && kRowBlock % kRowPad == 0, "whole blocks only");
 
 // C's columns are cut into panels of two vectors, and what is left into one of two vectors, one, or
 // half a one: the narrowest that holds it.
@@ -85,21 +118,32 @@ SURFCONV_INLINE void for_panels(int64_t width, const Body& body) {
   }
 }
 
-// MOST: rows of a block at most; `rows` is a multiple of UNIT.
-template <class T, bool TransposedA, int MOST, int UNIT = MOST>
+// The product of nothing.
+template <class T>
+void fill_rows(int64_t columns, int64_t rows, T* c, int64_t ldc, const T* initial) {
+  for (int64_t r = 0; initial != nullptr && r < rows; ++r) {
+    std::copy_n(initial, columns, c + r * ldc);
+  }
+}
+
+// MOST: rows of a block at most; `rows` is a multiple of UNIT. Fetches: each block of a tile brings
+// its part of the panel `next` into the second-level cache.
+template <class T, bool TransposedA, int MOST, int UNIT = MOST, bool Fetches = false>
 void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_t lda, const T* b,
-                int64_t ldb, T* c, int64_t ldc, const T* initial) {
+                int64_t ldb, T* c, int64_t ldc, const T* initial, const T* next = nullptr) {
+  if (depth == 0) return fill_rows(columns, rows, c, ldc, initial);
   constexpr int L = kLanes<T>, H = kHalfLanes<T>;
   constexpr int R = std::min(MOST, SURFCONV_GEMM_ROWS);
-  constexpr int S = std::min(MOST, SURFCONV_GEMM_NARROW_ROWS);
-  static_assert(UNIT % R == 0 && MOST % UNIT == 0 && MOST % S == 0, "whole blocks only");
+  static_assert(MOST % UNIT == 0 && MOST % R == 0, "whole blocks only");
   const int64_t row_step = TransposedA ? 1 : lda;
   const auto blocks = [&](auto block_rows, auto vectors, auto lanes) {
     constexpr int N = decltype(block_rows)::value, VECTORS = decltype(vectors)::value;
-    constexpr int STEPS = VECTORS == 1 && !TransposedA ? SURFCONV_GEMM_NARROW_STEPS : 1;
+    constexpr int64_t row_bytes = VECTORS * decltype(lanes)::value * sizeof(T);
+    constexpr int FETCHED = Fetches && VECTORS > 1 ? row_bytes * N / kTile : 0;
     const auto multiply = [&](auto some, int64_t r) SURFCONV_INLINED {
-      gemm_block<T, decltype(some)::value, VECTORS, decltype(lanes)::value, TransposedA, STEPS>(
-          depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc, initial);
+      gemm_block<T, decltype(some)::value, VECTORS, decltype(lanes)::value, TransposedA, FETCHED>(
+          depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc, initial,
+          reinterpret_cast<uintptr_t>(next) + depth * (r / N * FETCHED));
     };
     int64_t r = 0;
     for (; r + N <= rows; r += N) multiply(block_rows, r);
@@ -107,12 +151,10 @@ void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_
       for (; r < rows; r += UNIT) multiply(std::integral_constant<int, UNIT>{}, r);
     }
   };
-  using One = std::integral_constant<int, 1>;
   if (columns == 2 * L) {
-    blocks(std::integral_constant<int, R>{}, std::integral_constant<int, 2>{},
-           std::integral_constant<int, L>{});
+    blocks(std::integral_constant<int, R>{}, Two{}, std::integral_constant<int, L>{});
   } else if (columns == L) {
-    blocks(std::integral_constant<int, S>{}, One{}, std::integral_constant<int, L>{});
+    blocks(std::integral_constant<int, MOST>{}, One{}, std::integral_constant<int, L>{});
   } else {
     blocks(std::integral_constant<int, MOST>{}, One{}, std::integral_constant<int, H>{});
   }
@@ -134,10 +176,11 @@ void gemm_packed(const GemmPart& part, int64_t width, int64_t depth, const T* a,
   c += part.rows.begin * ldc;
   for_panels<T>(width, [&](int64_t column, int64_t columns) {
     if (column >= part.columns.end || column + columns <= part.columns.begin) return;
-    gemm_panel<T, false, kRowBlock, kRowPad>(columns, part.rows.count(), part.depth.count(), a, lda,
-                                             packed + column * depth + part.depth.begin * columns,
-                                             columns, c + column, ldc,
-                                             initial != nullptr ? initial + column : nullptr);
+    const T* panel = packed + column * depth + part.depth.begin * columns;
+    const bool last = column + columns >= width;
+    gemm_panel<T, false, kRowBlock, kRowPad, SURFCONV_GEMM_FETCHES>(
+        columns, part.rows.count(), part.depth.count(), a, lda, panel, columns, c + column, ldc,
+        initial != nullptr ? initial + column : nullptr, last ? panel : panel + depth * columns);
   });
 }
 

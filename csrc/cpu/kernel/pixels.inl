@@ -69,91 +69,6 @@ SURFCONV_INLINE void visit_storage(const View& view, const Body& body) {
   }
 }
 
-#if defined(__clang__)
-#define SURFCONV_SHUFFLE(T, N, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
-#else
-#define SURFCONV_SHUFFLE(T, N, a, b, ...) \
-  __builtin_shuffle(a, b, Vec<std::conditional_t<sizeof(T) == 8, int64_t, int32_t>, N>{__VA_ARGS__})
-#endif
-
-template <class T>
-SURFCONV_INLINE void transpose_4x4(const T* from, int64_t from_row, T* to, int64_t to_row) {
-  using V = Vec<T, 4>;
-  const V a = load<V>(from), b = load<V>(from + from_row);
-  const V c = load<V>(from + 2 * from_row), d = load<V>(from + 3 * from_row);
-  const V ab_lo = SURFCONV_SHUFFLE(T, 4, a, b, 0, 4, 1, 5);
-  const V ab_hi = SURFCONV_SHUFFLE(T, 4, a, b, 2, 6, 3, 7);
-  const V cd_lo = SURFCONV_SHUFFLE(T, 4, c, d, 0, 4, 1, 5);
-  const V cd_hi = SURFCONV_SHUFFLE(T, 4, c, d, 2, 6, 3, 7);
-  store(to, SURFCONV_SHUFFLE(T, 4, ab_lo, cd_lo, 0, 1, 4, 5));
-  store(to + to_row, SURFCONV_SHUFFLE(T, 4, ab_lo, cd_lo, 2, 3, 6, 7));
-  store(to + 2 * to_row, SURFCONV_SHUFFLE(T, 4, ab_hi, cd_hi, 0, 1, 4, 5));
-  store(to + 3 * to_row, SURFCONV_SHUFFLE(T, 4, ab_hi, cd_hi, 2, 3, 6, 7));
-}
-
-SURFCONV_INLINE void transpose_8x8(const float* from, int64_t from_row, float* to, int64_t to_row) {
-  using V = Vec<float, 8>;
-  V r[8], s[8];
-#pragma GCC unroll 8
-  for (int i = 0; i < 8; ++i) r[i] = load<V>(from + i * from_row);
-#pragma GCC unroll 4
-  for (int i = 0; i < 8; i += 2) {
-    s[i] = SURFCONV_SHUFFLE(float, 8, r[i], r[i + 1], 0, 8, 1, 9, 4, 12, 5, 13);
-    s[i + 1] = SURFCONV_SHUFFLE(float, 8, r[i], r[i + 1], 2, 10, 3, 11, 6, 14, 7, 15);
-  }
-#pragma GCC unroll 2
-  for (int i = 0; i < 8; i += 4) {
-    r[i] = SURFCONV_SHUFFLE(float, 8, s[i], s[i + 2], 0, 1, 8, 9, 4, 5, 12, 13);
-    r[i + 1] = SURFCONV_SHUFFLE(float, 8, s[i], s[i + 2], 2, 3, 10, 11, 6, 7, 14, 15);
-    r[i + 2] = SURFCONV_SHUFFLE(float, 8, s[i + 1], s[i + 3], 0, 1, 8, 9, 4, 5, 12, 13);
-    r[i + 3] = SURFCONV_SHUFFLE(float, 8, s[i + 1], s[i + 3], 2, 3, 10, 11, 6, 7, 14, 15);
-  }
-#pragma GCC unroll 4
-  for (int i = 0; i < 4; ++i) {
-    store(to + i * to_row, SURFCONV_SHUFFLE(float, 8, r[i], r[i + 4], 0, 1, 2, 3, 8, 9, 10, 11));
-    store(to + (i + 4) * to_row,
-          SURFCONV_SHUFFLE(float, 8, r[i], r[i + 4], 4, 5, 6, 7, 12, 13, 14, 15));
-  }
-}
-
-// to[column * to_row + row] = from[row * from_row + column] in whole blocks of SIZE x SIZE from
-// (row, column) on; returns where the blocks end.
-template <int SIZE, class T>
-int64_t transpose_blocks(const T* from, int64_t from_row, int64_t row, int64_t rows, int64_t column,
-                         int64_t columns, T* to, int64_t to_row) {
-  const int64_t end = row + (rows - row) / SIZE * SIZE;
-  for (; column + SIZE <= columns; column += SIZE) {
-    for (int64_t r = row; r < end; r += SIZE) {
-      const T* block = from + r * from_row + column;
-      if constexpr (SIZE == 8) {
-        transpose_8x8(block, from_row, to + column * to_row + r, to_row);
-      } else {
-        transpose_4x4(block, from_row, to + column * to_row + r, to_row);
-      }
-    }
-  }
-  return end;
-}
-
-template <class T>
-void transpose(const T* from, int64_t from_row, int64_t rows, int64_t columns, T* to,
-               int64_t to_row) {
-  int64_t row = 0;
-  if constexpr (sizeof(T) == 4 && kLanes<T> >= 8) {
-    row = transpose_blocks<8>(from, from_row, 0, rows, 0, columns, to, to_row);
-    if (columns % 8 >= 4) {
-      transpose_blocks<4>(from, from_row, 0, row, columns / 8 * 8, columns, to, to_row);
-    }
-  }
-  row = transpose_blocks<4>(from, from_row, row, rows, 0, columns, to, to_row);
-  const int64_t column = columns / 4 * 4;
-  for (int64_t r = 0; r < rows; ++r) {
-    for (int64_t c = r < row ? column : 0; c < columns; ++c) {
-      to[c * to_row + r] = from[r * from_row + c];
-    }
-  }
-}
-
 // Flat pixels first .. first+count-1 of an image as runs of constant stride.
 // body(pixels already done, pixels of the run, element offset of its first)
 template <class Body>
@@ -212,7 +127,10 @@ void load_pixels(const View& view, int64_t n, int64_t first_channel, int64_t cha
         for (int64_t p = 0; p < run; ++p) rows[p] = widen(from[p * view.x]);
       } else if (view.c != 1 && view.x == 1) {
         if constexpr (std::is_same_v<S, T>) {
-          transpose(from, view.c, channels, run, rows, ld);
+          for (int64_t p = 0; p < run; p += kStage) {
+            fetch_planes<false>(from + p, kStage, view.c, channels, kStage);
+            transpose(from + p, view.c, channels, std::min(kStage, run - p), rows + p * ld, ld);
+          }
         } else {
           T stage[8 * kStage];
           for (int64_t p = 0; p < run; p += kStage) {
@@ -263,7 +181,11 @@ void store_pixels(const View& view, int64_t n, int64_t first_channel, int64_t ch
       }
       if (view.c != 1 && view.x == 1) {
         if constexpr (std::is_same_v<S, T>) {
-          transpose(rows, ld, run, channels, to, view.c);
+          for (int64_t p = 0; p < run; p += kStage) {
+            const int64_t pixels = std::min(kStage, run - p);
+            if (p + kStage < run) fetch_planes<true>(to + p, kStage, view.c, channels, kStage);
+            transpose(rows + p * ld, ld, pixels, channels, to + p, view.c);
+          }
         } else {
           T stage[8 * kStage];
           for (int64_t p = 0; p < run; p += kStage) {
@@ -289,6 +211,19 @@ void store_pixels(const View& view, int64_t n, int64_t first_channel, int64_t ch
           }
         }
       }
+    });
+  });
+}
+
+// What store_pixels will write, where it lies in planes: fetched while it is computed.
+template <class T>
+void fetch_to_store(const View& view, int64_t n, int64_t first_channel, int64_t channels,
+                    int64_t width, int64_t first, int64_t count) {
+  if (view.c == 1 || view.x != 1) return;
+  visit_storage<T>(view, [&](auto* data) {
+    auto* origin = data + n * view.n + first_channel * view.c;
+    for_runs(view, width, first, count, [&](int64_t, int64_t run, int64_t offset) {
+      fetch_planes<true>(origin + offset, 0, view.c, channels, run);
     });
   });
 }

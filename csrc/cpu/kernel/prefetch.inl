@@ -3,15 +3,6 @@
 // depths, so these are where the lowest taps are now, some tiles further on. (The convolution's
 // backward gained nothing by it but for the gradients that it reads in place.)
 
-SURFCONV_INLINE void prefetch(uintptr_t place) {
-#if defined(SURFCONV_X86)
-  // Of the builtin g++ 12 thinks that it does nothing, and drops calls of functions around it.
-  asm volatile("prefetcht1 (%0)" : : "r"(place));
-#else
-  __builtin_prefetch(reinterpret_cast<const void*>(place), 0, 2);
-#endif
-}
-
 // Where channels of an image lie.
 struct ImagePart {
   const char* first_pixel;

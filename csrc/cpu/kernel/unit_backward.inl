@@ -4,6 +4,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 
 #include "vec.inl"
 #include "workspace.inl"
+#include "planes.inl"
 #include "pixels.inl"
 #include "guide.inl"
 #include "axis.inl"

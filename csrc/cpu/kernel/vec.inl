@@ -17,6 +17,9 @@ constexpr int kComparedBytes = std::min(SURFCONV_VECTOR_BYTES, 32);
 template <class T>
 constexpr int kComparedLanes = kComparedBytes / static_cast<int>(sizeof(T));
 
+using One = std::integral_constant<int, 1>;
+using Two = std::integral_constant<int, 2>;
+
 // Channels are stored in multiples of a quad, the narrowest vector of every instruction set in
 // float, so that no loop over channels needs a scalar tail.
 constexpr int64_t kQuad = 4;

@@ -43,10 +43,6 @@ SURFCONV_INLINE TapSide<W> tap_side(const Axis& axis, const AxisTable<T>& table,
   return {{read[0], 0}, {write[0], 0}, {weight_of<W>(T(1)), W{}}, W{}};
 }
 
-// How many places along an axis a tap has.
-using One = std::integral_constant<int, 1>;
-using Two = std::integral_constant<int, 2>;
-
 // body(rows of corners, tap along y, number of its first tap) for the rows taps_y of the kernel. K:
 // the size of a square kernel that is walked whole, whose loops are then unrolled, or 0.
 template <int K, class Body>
