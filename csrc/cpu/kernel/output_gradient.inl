@@ -70,7 +70,7 @@ class OutputGradient {
 
  private:
   void fetch_next_tile(const T* tile, int64_t lanes) const {
-    constexpr int64_t bytes = sizeof(T), kLine = 64;
+    constexpr int64_t bytes = sizeof(T);
     const uintptr_t start = reinterpret_cast<uintptr_t>(tile);
     for (int64_t m = kTile; m < 2 * kTile; ++m) {
       for (int64_t at = 0; at < lanes * bytes; at += kLine) {

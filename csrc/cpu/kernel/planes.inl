@@ -85,6 +85,8 @@ void transpose(const T* from, int64_t from_row, int64_t rows, int64_t columns, T
   }
 }
 
+constexpr int64_t kLine = 64;  // bytes of a cache line
+
 SURFCONV_INLINE void prefetch(uintptr_t place) {
 #if defined(SURFCONV_X86)
   // Of the builtin g++ 12 thinks that it does nothing, and drops calls of functions around it.
@@ -106,7 +108,7 @@ SURFCONV_INLINE void prefetch_to_write(uintptr_t place) {
 template <bool Writes, class S>
 SURFCONV_INLINE void fetch_planes(const S* first, int64_t ahead, int64_t plane, int64_t planes,
                                   int64_t pixels) {
-  constexpr int64_t bytes = sizeof(S), kLine = 64, kFew = 512;
+  constexpr int64_t bytes = sizeof(S), kFew = 512;
   if (std::abs(plane) < kFew) return;
   uintptr_t place = reinterpret_cast<uintptr_t>(first) + static_cast<uintptr_t>(ahead * bytes);
   for (int64_t c = 0; c < planes; ++c, place += static_cast<uintptr_t>(plane * bytes)) {

@@ -35,7 +35,7 @@ class FetchAhead {
   }
 
  private:
-  static constexpr int64_t kPixelsAhead = 2 * kTile, kLine = 64;
+  static constexpr int64_t kPixelsAhead = 2 * kTile;
 
   // The pixels that the window moves on by, as far as it covers them.
   const int64_t rows_, bytes_;
