@@ -127,7 +127,8 @@ void fill_rows(int64_t columns, int64_t rows, T* c, int64_t ldc, const T* initia
 }
 
 // MOST: rows of a block at most; `rows` is a multiple of UNIT. Fetches: each block of a tile brings
-// its part of the panel `next` into the second-level cache.
+// its part of the panel `next` into the second-level cache, step by step: all of it at its start
+// would hold it up.
 template <class T, bool TransposedA, int MOST, int UNIT = MOST, bool Fetches = false>
 void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_t lda, const T* b,
                 int64_t ldb, T* c, int64_t ldc, const T* initial, const T* next = nullptr) {

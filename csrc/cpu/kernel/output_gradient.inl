@@ -73,9 +73,7 @@ class OutputGradient {
     constexpr int64_t bytes = sizeof(T);
     const uintptr_t start = reinterpret_cast<uintptr_t>(tile);
     for (int64_t m = kTile; m < 2 * kTile; ++m) {
-      for (int64_t at = 0; at < lanes * bytes; at += kLine) {
-        prefetch(start + static_cast<uintptr_t>(m * view_.x * bytes + at));
-      }
+      fetch<false>(start + static_cast<uintptr_t>(m * view_.x * bytes), lanes * bytes);
     }
   }
 

@@ -104,6 +104,15 @@ SURFCONV_INLINE void prefetch_to_write(uintptr_t place) {
 #endif
 }
 
+// So many bytes from there on.
+template <bool Writes>
+SURFCONV_INLINE void fetch(uintptr_t place, int64_t bytes) {
+  for (int64_t at = 0; at < bytes; at += kLine) {
+    const uintptr_t line = place + static_cast<uintptr_t>(at);
+    Writes ? prefetch_to_write(line) : prefetch(line);
+  }
+}
+
 // So many pixels of each plane, `ahead` pixels on. Planes of few pixels need none of it.
 template <bool Writes, class S>
 SURFCONV_INLINE void fetch_planes(const S* first, int64_t ahead, int64_t plane, int64_t planes,
@@ -112,9 +121,6 @@ SURFCONV_INLINE void fetch_planes(const S* first, int64_t ahead, int64_t plane, 
   if (std::abs(plane) < kFew) return;
   uintptr_t place = reinterpret_cast<uintptr_t>(first) + static_cast<uintptr_t>(ahead * bytes);
   for (int64_t c = 0; c < planes; ++c, place += static_cast<uintptr_t>(plane * bytes)) {
-    for (int64_t at = 0; at < pixels * bytes; at += kLine) {
-      const uintptr_t line = place + static_cast<uintptr_t>(at);
-      Writes ? prefetch_to_write(line) : prefetch(line);
-    }
+    fetch<Writes>(place, pixels * bytes);
   }
 }

@@ -24,7 +24,7 @@ class FetchAhead {
   SURFCONV_INLINE void operator()(int64_t lowest) const {
     uintptr_t row = start_ + static_cast<uintptr_t>(lowest);
     for (int64_t i = 0; i < rows_; ++i, row -= step_y_) {
-      for (int64_t at = 0; at < bytes_; at += kLine) prefetch(row + static_cast<uintptr_t>(at));
+      fetch<false>(row, bytes_);
     }
   }
 
