@@ -1,5 +1,5 @@
-// Channels that lie in planes: transposed into pixels and back, and fetched ahead. A line of each
-// plane is more of them than the processor follows to fetch them by itself.
+// Channels that lie in planes: transposed into pixels and back, and fetched ahead, since there are
+// more planes than streams that the processor follows to fetch them by itself.
 #if defined(__clang__)
 #define SURFCONV_SHUFFLE(T, N, a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
 #else
