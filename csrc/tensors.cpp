@@ -5,6 +5,8 @@
 #include <torch/headeronly/core/ScalarType.h>
 #include <torch/headeronly/util/Exception.h>
 
+#include "cpu/memory.h"
+
 namespace surfconv {
 
 using cpu::DType;
@@ -99,7 +101,7 @@ cpu::Executor executor() {
       for (int64_t worker = begin; worker < end; ++worker) body(context, static_cast<int>(worker));
     });
   };
-  return {static_cast<int>(torch::stable::get_num_threads()), run};
+  return {static_cast<int>(torch::stable::get_num_threads()), cpu::second_level_cache(), run};
 }
 
 }  // namespace surfconv

@@ -1,5 +1,8 @@
 #include "memory.h"
 
+#include <unistd.h>
+
+#include <algorithm>
 #include <mutex>
 #include <new>
 #include <vector>
@@ -73,6 +76,18 @@ void return_block(Block block) noexcept {
     }
   }
   free_block(block);
+}
+
+int64_t second_level_cache() {
+  static const int64_t bytes = [] {
+    constexpr int64_t kSmall = int64_t{256} << 10;
+#if defined(_SC_LEVEL2_CACHE_SIZE)
+    return std::max<int64_t>(kSmall, sysconf(_SC_LEVEL2_CACHE_SIZE));
+#else
+    return kSmall;
+#endif
+  }();
+  return bytes;
 }
 
 }  // namespace surfconv::cpu

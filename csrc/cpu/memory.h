@@ -1,7 +1,9 @@
-// Work memory that outlives a call: fresh pages cost more than small layers compute.
+// Work memory that outlives a call: fresh pages cost more than small layers compute. And the cache
+// that it should fit.
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 
 namespace surfconv::cpu {
 
@@ -16,5 +18,8 @@ struct Block {
 // Throws std::bad_alloc. Both may be called from any thread, and after a fork.
 Block take_block(size_t bytes);
 void return_block(Block block) noexcept;
+
+// Bytes; a small one's where the system does not tell.
+int64_t second_level_cache();
 
 }  // namespace surfconv::cpu

@@ -46,6 +46,7 @@ struct BackwardTensors {
 // kernels share their work through a queue, so a runner may also call the workers one by one.
 struct Executor {
   int threads;
+  int64_t cache;  // bytes of it that each worker has to itself: decides what is computed together
   void (*run)(int workers, void (*body)(void* context, int worker), void* context);
 };
 

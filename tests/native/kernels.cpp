@@ -93,26 +93,26 @@ void run_backwards(int workers, Body body, void* context) {
   while (workers-- > 0) body(context, workers);
 }
 
-cpu::Executor executor(int threads, bool in_turn) {
-  return {threads, in_turn ? run_backwards : run_in_threads};
+cpu::Executor executor(int threads, bool in_turn, int64_t cache) {
+  return {threads, cache, in_turn ? run_backwards : run_in_threads};
 }
 
 void forward(const std::string& name, const py::array& input, const py::array& weight,
              const Array& bias, const py::array& scale, const Array& guide, const py::array& output,
-             const Arguments& arguments, int threads, bool in_turn) {
+             const Arguments& arguments, int threads, bool in_turn, int64_t cache) {
   const cpu::ForwardTensors tensors{view_of(input, false), view_of(weight, false),
                                     view_of(bias, false),  view_of(scale, false),
                                     view_of(guide, false), view_of(output, true)};
   const cpu::Conv conv = arguments.conv(input, weight, scale);
   const cpu::Kernels& kernels = find(name);
   py::gil_scoped_release release;
-  kernels.forward(conv, tensors, executor(threads, in_turn));
+  kernels.forward(conv, tensors, executor(threads, in_turn, cache));
 }
 
 void backward(const std::string& name, const py::array& grad_output, const py::array& input,
               const py::array& weight, const py::array& scale, const Array& guide,
               const Array& grad_input, const Array& grad_weight, const Array& grad_bias,
-              const Array& grad_scale, const Arguments& arguments, int threads, bool in_turn) {
+              const Array& grad_scale, const Arguments& arguments, int threads, bool in_turn, int64_t cache) {
   const cpu::BackwardTensors tensors{
       view_of(grad_output, false), view_of(input, false),    view_of(weight, false),
       view_of(scale, false),       view_of(guide, false),    view_of(grad_input, true),
@@ -120,7 +120,7 @@ void backward(const std::string& name, const py::array& grad_output, const py::a
   const cpu::Conv conv = arguments.conv(input, weight, scale);
   const cpu::Kernels& kernels = find(name);
   py::gil_scoped_release release;
-  kernels.backward(conv, tensors, executor(threads, in_turn));
+  kernels.backward(conv, tensors, executor(threads, in_turn, cache));
 }
 
 std::vector<std::string> names() {

@@ -48,12 +48,18 @@ class Poisoned:
 
 @dataclass
 class NativeOperator:
-    """Called as surf_conv2d is; `in_turn` runs the workers one by one, last first."""
+    """Called as surf_conv2d is; `in_turn` runs the workers one by one, last first. `cache`: bytes
+    that a worker is told it has, which decides how much is computed at once."""
 
     kernels: ModuleType
     name: str
     threads: int = 1
     in_turn: bool = False
+    cache: int = 1 << 21
+
+    @property
+    def executor(self) -> tuple[int, bool, int]:
+        return self.threads, self.in_turn, self.cache
 
     def __call__(
         self,
@@ -93,9 +99,7 @@ class _Native(torch.autograd.Function):
         ctx.save_for_backward(input, weight, scale, guide)
         output = Poisoned(input, (input.shape[0], weight.shape[0], *scale.shape[2:]))
         arrays = map(to_array, (input, weight, bias, scale, guide, output.tensor))
-        operator.kernels.forward(
-            operator.name, *arrays, arguments, operator.threads, operator.in_turn
-        )
+        operator.kernels.forward(operator.name, *arrays, arguments, *operator.executor)
         return output.result()
 
     @staticmethod
@@ -113,7 +117,6 @@ class _Native(torch.autograd.Function):
             operator.name,
             *map(to_array, (*tensors, *written)),
             ctx.arguments,
-            operator.threads,
-            operator.in_turn,
+            *operator.executor,
         )
         return (None, None, *(r if r is None else r.result() for r in results), None)

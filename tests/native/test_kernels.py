@@ -108,6 +108,33 @@ def test_same_bits_for_any_number_and_order_of_workers(
         assert_same_bits(value, expected[name], name)
 
 
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
+@pytest.mark.parametrize("channels", [(8, 12), (70, 130), (12, 256)])
+def test_same_bits_however_many_tiles_are_multiplied_at_once(
+    native: NativeOperator, layout: str, channels: tuple[int, int]
+) -> None:
+    problem = make_problem(2, *channels, size=(17, 21), layout=layout)
+    grad = torch.randn(problem.output_shape())
+    one = replace(native, cache=0)
+    assert_same_bits(problem.run(native), problem.run(one))
+    expected = problem.gradients(one, grad)
+    for name, value in problem.gradients(native, grad).items():
+        assert_same_bits(value, expected[name], name)
+    problem.check_gradients(native)
+
+
+@pytest.mark.parametrize("guide", ["none", "holes"])
+@pytest.mark.parametrize("size", [(7, 7), (14, 14), (13, 30)])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_several_tiles_at_once(
+    native: NativeOperator, guide: str, size: tuple[int, int], threads: int
+) -> None:
+    problem = make_problem(2, 66, 40, size=size, kernel=5, padding=2, scale="random", guide=guide)
+    other = replace(native, threads=threads)
+    problem.check_forward(other)
+    problem.check_gradients(other)
+
+
 @pytest.mark.parametrize("name", GRADIENTS)
 def test_each_gradient_alone(native: NativeOperator, name: str) -> None:
     problem = make_problem()

@@ -6,14 +6,14 @@ class Backward {
       : conv_(conv),
         tensors_(tensors),
         executor_(executor),
-        tile_(conv, tensors),
-        input_(conv, tile_.plan(), tensors.input),
+        tiles_(conv, tensors, executor),
+        input_(conv, tiles_.plan(), tensors.input),
         guide_(conv, tensors.guide),
-        grad_input_(conv, tile_.plan(), tensors.grad_input) {
-    tile_.pack_weights(executor);
-    for (const Unit& unit : tile_.units()) {
+        grad_input_(conv, tiles_.plan(), tensors.grad_input) {
+    tiles_.pack_weights(executor);
+    for (const Unit& unit : tiles_.units()) {
       weight_offset_.push_back(weight_elements_);
-      weight_elements_ += tile_.weight_elements(unit);
+      weight_elements_ += tiles_.weight_elements(unit);
     }
   }
 
@@ -59,7 +59,7 @@ class Backward {
  private:
   static constexpr int64_t kTasks = 32;
 
-  int64_t units() const { return static_cast<int64_t>(tile_.units().size()); }
+  int64_t units() const { return static_cast<int64_t>(tiles_.units().size()); }
   int64_t scale_elements(const Pass& pass) const {
     return conv_.scale_components * pass.out.count() * conv_.x.out;
   }
@@ -70,17 +70,17 @@ class Backward {
     return std::max<int64_t>(
         1, std::min(kTasks / units(), map / std::max<int64_t>(1, weight_elements_)));
   }
-  int64_t partial_elements() const { return weight_elements_ + tile_.bias_elements(); }
+  int64_t partial_elements() const { return weight_elements_ + tiles_.bias_elements(); }
 
   void run_slots(const Pass& pass, const std::vector<Slot>& slots) {
-    const Plan& plan = tile_.plan();
+    const Plan& plan = tiles_.plan();
     const int64_t pixels = pass.images * pass.out.count() * conv_.x.out;
     const int workers = workers_for(executor_, static_cast<int64_t>(slots.size()) * units(),
                                     pixels * plan.taps * plan.channels * conv_.out_channels);
-    Workspace memory(workers * tile_.need());
-    std::vector<typename BackwardTile<T>::Scratch> scratch;
+    Workspace memory(workers * tiles_.need());
+    std::vector<typename BackwardTiles<T>::Scratch> scratch;
     scratch.reserve(static_cast<size_t>(workers));
-    for (int i = 0; i < workers; ++i) scratch.push_back(tile_.take(memory));
+    for (int i = 0; i < workers; ++i) scratch.push_back(tiles_.take(memory));
     for (int phase = 0; phase < kPhases; ++phase) {
       std::vector<const Slot*> chosen;
       for (const Slot& slot : slots) {
@@ -95,9 +95,9 @@ class Backward {
     }
   }
 
-  void run_slot(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
+  void run_slot(typename BackwardTiles<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
                 int64_t unit) {
-    typename BackwardTile<T>::Target target{};
+    typename BackwardTiles<T>::Target target{};
     T* const partial = partials_.get() + slot.partial * partial_elements();
     if (tensors_.grad_weight.data != nullptr) {
       target.weight = partial + weight_offset_[static_cast<size_t>(unit)];
@@ -114,8 +114,8 @@ class Backward {
   }
 
   // All tiles of an image of the pass; or only those that reach further than their slot.
-  void run_tiles(typename BackwardTile<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
-                 int64_t image, int64_t unit, typename BackwardTile<T>::Target target,
+  void run_tiles(typename BackwardTiles<T>::Scratch& scratch, const Pass& pass, const Slot& slot,
+                 int64_t image, int64_t unit, typename BackwardTiles<T>::Target target,
                  bool only_further) {
     constexpr int64_t bytes = sizeof(T);
     const int64_t n = pass.first_image + image, end = slot.out.end * conv_.x.out;
@@ -133,11 +133,12 @@ class Backward {
     const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in,
                             grad_input_.needed() ? &places : nullptr};
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
-    for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += kTile) {
-      const int64_t count = std::min<int64_t>(kTile, end - begin);
+    const int64_t most = only_further ? kTile : tiles_.most_pixels();
+    for (int64_t begin = slot.out.begin * conv_.x.out; begin < end; begin += most) {
+      const int64_t count = std::min(most, end - begin);
       if (only_further && !is_far(slot, n, begin, count)) continue;
-      tile_.run(scratch, tile_.units()[static_cast<size_t>(unit)], target, guide_.image(n), n,
-                begin, static_cast<int>(count), steps_y, steps_x);
+      tiles_.run(scratch, tiles_.units()[static_cast<size_t>(unit)], target, guide_.image(n), n,
+                 begin, static_cast<int>(count), steps_y, steps_x);
     }
   }
 
@@ -154,9 +155,9 @@ class Backward {
     if (!grad_input_.needed() || std::none_of(slots.begin(), slots.end(), far)) return;
     const int workers =
         workers_for(executor_, units(), units() * pass.out.count() * conv_.x.out * kBlock);
-    Workspace memory(workers * tile_.need());
-    std::vector<typename BackwardTile<T>::Scratch> scratch;
-    for (int i = 0; i < workers; ++i) scratch.push_back(tile_.take(memory));
+    Workspace memory(workers * tiles_.need());
+    std::vector<typename BackwardTiles<T>::Scratch> scratch;
+    for (int i = 0; i < workers; ++i) scratch.push_back(tiles_.take(memory));
     run_tasks(executor_, units(), workers, [&](int worker, int64_t unit) {
       for (const Slot& slot : slots) {
         if (!slot.far) continue;
@@ -195,9 +196,9 @@ class Backward {
     run_tasks(executor_, units(), workers_for(executor_, units(), weight_elements_),
               [&](int, int64_t unit) {
                 const T* from = partials + weight_offset_[static_cast<size_t>(unit)];
-                for (const ChannelBlock& block : tile_.units()[static_cast<size_t>(unit)].blocks) {
-                  tile_.store_weights(block, from, tensors_.grad_weight);
-                  from += tile_.weight_elements(block);
+                for (const ChannelBlock& block : tiles_.units()[static_cast<size_t>(unit)].blocks) {
+                  tiles_.store_weights(block, from, tensors_.grad_weight);
+                  from += tiles_.weight_elements(block);
                 }
               });
   }
@@ -205,7 +206,7 @@ class Backward {
   const Conv& conv_;
   const BackwardTensors& tensors_;
   const Executor& executor_;
-  BackwardTile<T> tile_;
+  BackwardTiles<T> tiles_;
   InputRows<T> input_;
   GuideRows<T> guide_;
   GradientRows<T> grad_input_;

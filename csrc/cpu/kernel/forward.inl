@@ -1,7 +1,7 @@
-// Forward: for each tile of output pixels the corners once, then for each block of taps and
+// Forward: for each few tiles of output pixels the corners once, then for each block of taps and
 // channels a gathered matrix that stays in cache and its product with the packed weights.
 
-// Outputs of a tile that are one task.
+// Outputs of some tiles that are one task.
 struct Outputs {
   Range groups;
   Range channels;  // of each group
@@ -22,6 +22,9 @@ class Forward {
                : plan_.lanewise ? plan_.multiplier * plan_.row
                                 : pad_width<T>(plan_.outputs)),
         ld_rows_(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), 16) + 16),
+        most_tiles_(plan_.lanewise || few_
+                        ? 1
+                        : Tiles<T>::at_once(conv, taps_, ld_rows_, executor.cache, kMostTiles)),
         input_(conv, plan_, tensors.input),
         guide_(conv, tensors.guide),
         fused_(plan_.lanewise && plan_.mix == 1 && plan_.multiplier == 1),
@@ -37,46 +40,57 @@ class Forward {
     const std::vector<Pass> passes =
         make_passes<T>(conv_, tensors_.scale, input_.packed(), input_.row_elements());
     input_.reserve(passes);
-    const int64_t work = conv_.x.out * plan_.taps * plan_.channels * conv_.out_channels;
-    const int64_t most_tiles = (conv_.y.out * conv_.x.out + kTile - 1) / kTile;
-    const int workers = workers_for(executor_, passes[0].images * most_tiles * pieces(),
-                                    conv_.y.out * conv_.batch * work);
-    const int64_t need = Tile<T>::need(conv_, taps_) + Workspace::need<T>(kTile * ld_rows_) +
-                         Workspace::need<T>(kTile * plan_.groups * width_) +
+    const int64_t pixels = conv_.y.out * conv_.x.out;
+    const int workers =
+        workers_for(executor_, conv_.batch * tiles_of(pixels) * pieces(),
+                    conv_.batch * pixels * plan_.taps * plan_.channels * conv_.out_channels);
+    const int64_t most_pixels = most_tiles_ * kTile;
+    const int64_t need = Tiles<T>::need(conv_, taps_, most_tiles_) +
+                         Workspace::need<T>(most_pixels * ld_rows_) +
+                         Workspace::need<T>(most_pixels * plan_.groups * width_) +
                          (fused_ ? LaneScratch<T>::need(conv_) : 0);
     Workspace memory(workers * need);
     std::vector<Scratch> scratch;
     scratch.reserve(static_cast<size_t>(workers));
     for (int i = 0; i < workers; ++i) {
-      scratch.push_back({Tile<T>(conv_, taps_, memory),
-                         memory.take<T>(kTile * ld_rows_),
-                         memory.take<T>(kTile * plan_.groups * width_),
+      scratch.push_back({Tiles<T>(conv_, taps_, most_tiles_, memory),
+                         memory.take<T>(most_pixels * ld_rows_),
+                         memory.take<T>(most_pixels * plan_.groups * width_),
                          {}});
       if (fused_) scratch.back().lanes.take(conv_, memory);
     }
     for (const Pass& pass : passes) {
       input_.pack(pass, executor_);
       guide_.pack(pass.first_image, pass.images, executor_);
-      const int64_t first = pass.out.begin * conv_.x.out, pixels = pass.out.count() * conv_.x.out;
-      const int64_t tiles = (pixels + kTile - 1) / kTile;
-      const Shares shares(pass.images * whole_tiles(pixels, kTile), pieces(), piece(), workers);
-      run_tasks(
-          executor_, pass.images * tiles * shares.count(), workers, [&](int worker, int64_t task) {
-            const int64_t of_all = task / shares.count(), done = of_all % tiles * kTile;
-            tile(scratch[static_cast<size_t>(worker)], pass, pass.first_image + of_all / tiles,
-                 first + done, static_cast<int>(std::min<int64_t>(kTile, pixels - done)),
-                 outputs_of(shares.pieces(task % shares.count())));
-          });
+      run_pass(pass, scratch, workers);
     }
   }
 
  private:
+  static constexpr int64_t kMostTiles = 4;  // more gained nothing, however large the weights
+
   struct Scratch {
-    Tile<T> tile;
-    T* rows;  // gathered matrix [kTile][ld_rows]
-    T* out;   // [kTile][groups * width]
+    Tiles<T> tiles;
+    T* rows;  // gathered matrix [pixels of the tiles][ld_rows]
+    T* out;   // [pixels of the tiles][groups * width]
     LaneScratch<T> lanes;
   };
+
+  void run_pass(const Pass& pass, std::vector<Scratch>& scratch, int workers) {
+    const int64_t first = pass.out.begin * conv_.x.out, pixels = pass.out.count() * conv_.x.out;
+    const Shares shares(pass.images, pixels, most_tiles_, pieces(), piece(), workers);
+    const int64_t tiles = tiles_of(pixels), runs = shares.runs();
+    run_tasks(executor_, pass.images * runs * shares.count(), workers,
+              [&](int worker, int64_t task) {
+                const int64_t of_all = task / shares.count(), run = of_all % runs;
+                const int64_t begin = tiles * run / runs * kTile;
+                const int64_t end = std::min(tiles * (run + 1) / runs * kTile, pixels);
+                multiply_tiles(scratch[static_cast<size_t>(worker)], pass,
+                               pass.first_image + of_all / runs, first + begin,
+                               static_cast<int>(end - begin),
+                               outputs_of(shares.pieces(task % shares.count())));
+              });
+  }
 
   // What the outputs of a tile may be cut into, for products: groups, or panels of the only one.
   int64_t pieces() const {
@@ -136,14 +150,16 @@ class Forward {
               });
   }
 
-  void tile(Scratch& scratch, const Pass& pass, int64_t n, int64_t begin, int count,
-            const Outputs& outputs) {
+  void multiply_tiles(Scratch& scratch, const Pass& pass, int64_t n, int64_t begin, int count,
+                      const Outputs& outputs) {
     constexpr int64_t bytes = sizeof(T);
     const char* base = input_.image(pass, n);
     const int64_t unseen = byte_distance(base, unseen_.data());
     const AxisSteps steps_y{input_.step_y() * bytes, conv_.x.in};
     const AxisSteps steps_x{input_.step_x() * bytes, 1};
-    scratch.tile.place(tensors_.scale, guide_.image(n), n, begin, count, steps_y, steps_x, false);
+    Tiles<T>& tiles = scratch.tiles;
+    tiles.place(tensors_.scale, guide_.image(n), n, begin, count, steps_y, steps_x, false);
+    Tile<T>& only = tiles.front();  // lanewise and with few outputs
     // Straight into the output where whole blocks of the product fit there.
     const bool direct = writes_rows_ && (fused_ || few_ || count % kRowPad == 0);
     const int64_t ld_out = direct ? tensors_.output.x : plan_.groups * width_;
@@ -151,35 +167,33 @@ class Forward {
                           begin * tensors_.output.x
                     : scratch.out;
     const int64_t group_step = direct ? plan_.outputs : width_;
-    const auto fetch_ahead = [&](int64_t channel, int64_t channels) SURFCONV_INLINED {
+    const auto fetch_ahead = [&](const Tile<T>& tile, int pixels, int64_t channel,
+                                 int64_t channels) SURFCONV_INLINED {
       if (conv_.y.kernel == 1) return;
       const ImagePart part{base + channel * bytes, steps_y.read, steps_x.read, channels * bytes};
       const FetchAhead fetch(conv_.y, conv_.x, part);
-      fetch(scratch.tile.rows().read + (conv_.y.kernel * 2 - 1) * kTile,
-            scratch.tile.columns().read + conv_.x.kernel / 2 * 2 * kTile, count);
+      fetch(tile.rows().read + (conv_.y.kernel * 2 - 1) * kTile,
+            tile.columns().read + conv_.x.kernel / 2 * 2 * kTile, pixels);
     };
     if (fused_) {
-      fetch_ahead(0, plan_.row);
-      lane_forward(conv_, plan_, scratch.tile, scratch.lanes, base, steps_y.read, steps_x.read,
+      fetch_ahead(only, count, 0, plan_.row);
+      lane_forward(conv_, plan_, only, scratch.lanes, base, steps_y.read, steps_x.read,
                    weights_.get(), initial_.data(), out, ld_out);
     }
     if (few_) {
-      if (scratch.tile.needs_list()) {
-        scratch.tile.template fill_taps<false, Slopes::none>(0, plan_.taps, unseen, 0);
-      }
-      few_forward(few_, FewTile<T>{conv_, scratch.tile, base, weights_.get(), initial_.data(), out,
-                                   ld_out});
+      tiles.template fill_taps<false, Slopes::none>(0, plan_.taps, unseen, 0);
+      few_forward(few_,
+                  FewTile<T>{conv_, only, base, weights_.get(), initial_.data(), out, ld_out});
     }
-    const bool gathers =
-        !few_ && (!fused_ || (scratch.tile.guided() && scratch.tile.has(Place::other)));
+    const bool gathers = !few_ && (!fused_ || (only.guided() && only.has(Place::other)));
     if (plan_.lanewise && gathers) {
-      for_gathered_runs(scratch.tile, count, [&](const Run& run) {
+      for_gathered_runs(only, count, [&](const Run& run) {
         for (int m = run.begin; m < run.end; ++m) {
           std::memcpy(out + m * ld_out, initial_.data(), static_cast<size_t>(width_ * bytes));
         }
       });
     }
-    if (gathers && !plan_.lanewise) scratch.tile.find_seen(count, false);
+    if (gathers && !plan_.lanewise) tiles.find_seen(false);
     if (!direct && !plan_.lanewise) {
       for_stored(outputs, [&](int64_t channel, int64_t channels, int64_t) SURFCONV_INLINED {
         fetch_to_store<T>(tensors_.output, n, channel, channels, conv_.x.out, begin, count);
@@ -187,17 +201,19 @@ class Forward {
     }
     for (int64_t first_tap = 0; gathers && first_tap < plan_.taps; first_tap += taps_) {
       const int64_t taps = std::min(taps_, plan_.taps - first_tap);
-      if (scratch.tile.needs_list()) {
-        scratch.tile.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
-      }
+      tiles.template fill_taps<false, Slopes::none>(first_tap, taps, unseen, 0);
       for (const ChannelBlock& block : blocks_) {
         if (!outputs.groups.has(block.group)) continue;
         const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
         // What pads the channels costs the product nothing.
         const int64_t step = plan_.lanewise ? block.padded : block.count;
-        gather_tile(conv_, scratch.tile, first_tap, taps, base + channel * bytes, block.padded,
-                    scratch.rows, ld_rows_, step, fused_);
-        if (first_tap + taps == plan_.taps) fetch_ahead(channel, block.padded);
+        const bool last_taps = first_tap + taps == plan_.taps;
+        tiles.for_each([&](const Tile<T>& tile, int first, int pixels) {
+          gather_tile(conv_, tile, first_tap, taps, base + channel * bytes, block.padded,
+                      scratch.rows + first * ld_rows_, ld_rows_, step, fused_);
+          const bool last = first + pixels == count;  // for the others the processor keeps up
+          if (last && last_taps) fetch_ahead(tile, pixels, channel, block.padded);
+        });
         if (plan_.lanewise) {
           multiply_lanes(scratch, block, first_tap, taps, count, out, ld_out);
         } else {
@@ -205,7 +221,7 @@ class Forward {
           const T* weights = packed(block, first_tap, taps);
           T* to = out + block.group * group_step;
           const T* initial = first ? initial_.data() + block.group * width_ : nullptr;
-          scratch.tile.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
+          tiles.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
             const GemmPart part{pixels, {seen.begin * step, seen.end * step}, outputs.channels};
             gemm_packed<T>(part, plan_.outputs, taps * step, scratch.rows, ld_rows_, weights, to,
                            ld_out, initial);
@@ -249,7 +265,7 @@ class Forward {
                       int count, T* out, int64_t ld_out) const {
     const LaneBlock part = lane_block(plan_, block, first_tap, taps);
     with_mix<T>(plan_, [&](auto mix) {
-      for_gathered_runs(scratch.tile, count, [&](const Run& run) {
+      for_gathered_runs(scratch.tiles.front(), count, [&](const Run& run) {
         lane_multiply<decltype(mix)::value>(
             part, run.end - run.begin, scratch.rows + run.begin * ld_rows_, ld_rows_,
             weights_.get(), out + run.begin * ld_out + block.first, ld_out, plan_.row);
@@ -265,6 +281,7 @@ class Forward {
   const int64_t taps_;
   const Few few_;
   const int64_t width_, ld_rows_;
+  const int most_tiles_;  // at once
   InputRows<T> input_;
   GuideRows<T> guide_;
   const bool fused_;  // lanewise without a gathered matrix, but where a guide hides corners

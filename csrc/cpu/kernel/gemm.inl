@@ -144,7 +144,7 @@ void gemm_panel(int64_t columns, int64_t rows, int64_t depth, const T* a, int64_
     const auto multiply = [&](auto some, int64_t r) SURFCONV_INLINED {
       gemm_block<T, decltype(some)::value, VECTORS, decltype(lanes)::value, TransposedA, FETCHED>(
           depth, a + r * row_step, lda, b, ldb, c + r * ldc, ldc, initial,
-          reinterpret_cast<uintptr_t>(next) + depth * (r / N * FETCHED));
+          reinterpret_cast<uintptr_t>(next) + depth * (r % kTile / N * FETCHED));
     };
     int64_t r = 0;
     for (; r + N <= rows; r += N) multiply(block_rows, r);
@@ -201,4 +201,43 @@ void gemm_transposed(int64_t rows, int64_t width, int64_t depth, const T* a, int
     gemm_panel<T, true, MOST>(columns, rows, depth, a, lda, b + column, ldb, c + column, ldc,
                               nullptr);
   });
+}
+
+// The same by way of copies whose rows lie side by side: where every step of the depth meets other
+// pages, processors run slower, and rows a power of two apart share few sets of the first cache.
+constexpr int64_t kCopiedRows = 48;
+static_assert(kCopiedRows % kRowBlock == 0, "whole blocks only");
+
+// Elements of the copies.
+inline int64_t copied_elements(int64_t depth, int64_t width) {
+  return depth * (kCopiedRows + width);
+}
+// Whether a product of this width is worth them.
+inline bool worth_copying(int64_t width) { return width >= 128; }
+
+// width: of whole panels.
+template <class T>
+void gemm_transposed_copied(int64_t rows, int64_t width, int64_t depth, const T* a, int64_t lda,
+                            const T* b, int64_t ldb, T* c, int64_t ldc, T* copies) {
+  const auto copy = [&](const T* from, int64_t ld, int64_t columns, T* to, auto lanes) {
+    using V = Vec<T, decltype(lanes)::value>;
+    for (int64_t k = 0; k < depth; ++k, from += ld, to += columns) {
+      for (int64_t i = 0; i < columns; i += decltype(lanes)::value) {
+        store(to + i, load<V>(from + i));
+      }
+    }
+  };
+  constexpr std::integral_constant<int, kHalfLanes<T>> half{};
+  T* const panels = copies + depth * kCopiedRows;
+  for_panels<T>(width, [&](int64_t column, int64_t columns) {
+    copy(b + column, ldb, columns, panels + column * depth, half);
+  });
+  for (int64_t r = 0; r < rows; r += kCopiedRows) {
+    const int64_t count = std::min(kCopiedRows, rows - r);
+    copy(a + r, lda, count, copies, std::integral_constant<int, 4>{});
+    for_panels<T>(width, [&](int64_t column, int64_t columns) {
+      gemm_panel<T, true, kRowBlock>(columns, count, depth, copies, count, panels + column * depth,
+                                     columns, c + r * ldc + column, ldc, nullptr);
+    });
+  }
 }

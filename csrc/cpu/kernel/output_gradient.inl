@@ -1,8 +1,8 @@
-// The gradient of the output as the backward pass of a unit meets it, tile by tile.
+// The gradient of the output as the backward pass of a unit meets it, a few tiles at a time.
 template <class T>
 class OutputGradient {
  public:
-  // The gradient of the output at a tile's pixels: a pixel every `ld`, of lanes
+  // The gradient of the output at some pixels: a pixel every `ld`, of lanes
   // [multiplier][kBlock].
   struct Part {
     const T* data;
@@ -24,14 +24,16 @@ class OutputGradient {
 
   int64_t width() const { return width_; }
 
-  // In place where whole blocks of the products may read it there; then the next tile's is fetched.
-  Part read(const Unit& unit, int64_t n, int64_t begin, int count, T* scratch) const {
+  // In place where whole blocks of the products may read it there; then what follows is fetched.
+  // scratch: [group of the unit][most pixels][width]
+  Part read(const Unit& unit, int64_t n, int64_t begin, int count, T* scratch,
+            int64_t most_pixels) const {
     const View& from = view_;
     const ChannelBlock& block = unit.blocks.front();
     if (in_place_ && count % kRowPad == 0) {
       const T* pixel = static_cast<const T*>(from.data) + n * from.n + begin * from.x;
       const int64_t first = plan_.lanewise ? block.first : block.group * plan_.outputs;
-      fetch_next_tile(pixel + first, plan_.lanewise ? block.padded : plan_.outputs);
+      fetch_next(pixel + first, count, plan_.lanewise ? block.padded : plan_.outputs);
       return {pixel + first, from.x, plan_.outputs, block.group};
     }
     if (plan_.lanewise) {  // a unit of lanes is one block
@@ -42,10 +44,10 @@ class OutputGradient {
     } else {
       for (int64_t g = block.group; g <= unit.blocks.back().group; ++g) {
         load_pixels<T>(from, n, g * plan_.outputs, plan_.outputs, conv_.x.out, begin, count,
-                       scratch + (g - block.group) * kTile * width_, width_, width_);
+                       scratch + (g - block.group) * most_pixels * width_, width_, width_);
       }
     }
-    return {scratch, width_, kTile * width_, block.group};
+    return {scratch, width_, most_pixels * width_, block.group};
   }
 
   void add_bias(const Part& part, const Unit& unit, int count, T* bias) const {
@@ -53,7 +55,11 @@ class OutputGradient {
       const T* from = part.of(block);
       if (!plan_.lanewise) {
         if (block.first != 0) continue;
-        add_columns(from, part.ld, count, plan_.outputs, bias + block.group * plan_.outputs);
+        // Tile by tile: the same sums however many there are at once.
+        for (int begin = 0; begin < count; begin += kTile) {
+          add_columns(from + begin * part.ld, part.ld, std::min(kTile, count - begin),
+                      plan_.outputs, bias + block.group * plan_.outputs);
+        }
         continue;
       }
       for (int64_t j = 0; j < plan_.multiplier; ++j) {
@@ -69,10 +75,11 @@ class OutputGradient {
   }
 
  private:
-  void fetch_next_tile(const T* tile, int64_t lanes) const {
+  // As many pixels more.
+  void fetch_next(const T* first, int count, int64_t lanes) const {
     constexpr int64_t bytes = sizeof(T);
-    const uintptr_t start = reinterpret_cast<uintptr_t>(tile);
-    for (int64_t m = kTile; m < 2 * kTile; ++m) {
+    const uintptr_t start = reinterpret_cast<uintptr_t>(first);
+    for (int64_t m = count; m < 2 * count; ++m) {
       fetch<false>(start + static_cast<uintptr_t>(m * view_.x * bytes), lanes * bytes);
     }
   }

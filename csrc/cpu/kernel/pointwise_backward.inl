@@ -157,7 +157,7 @@ class PointwiseBackward {
     T* bias = tensors_.grad_bias.data != nullptr ? partial + partial_ : nullptr;
     if (!planar_) {
       const auto gradients =
-          output_.read(unit, n, begin, static_cast<int>(count), scratch.grad_out);
+          output_.read(unit, n, begin, static_cast<int>(count), scratch.grad_out, kTile);
       if (bias != nullptr) output_.add_bias(gradients, unit, static_cast<int>(count), bias);
       for (const ChannelBlock& block : unit.blocks) {
         rows(scratch, block, n, begin, count, gradients.of(block), gradients.ld, filters, weight);

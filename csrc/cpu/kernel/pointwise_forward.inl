@@ -16,20 +16,19 @@ class PointwiseForward {
 
   void run() {
     const int64_t pixels = conv_.y.out * conv_.x.out;
-    const int64_t size = planar_ ? kPlaneTile : kTile;
-    const int64_t tiles = (pixels + size - 1) / size, all = conv_.batch * tiles * plan_.groups;
+    const int64_t tiles = tiles_of(pixels), all = conv_.batch * tiles * plan_.groups;
     const int workers = workers_for(executor_, all * pieces(),
                                     conv_.batch * pixels * plan_.channels * conv_.out_channels);
-    const Shares shares(conv_.batch * whole_tiles(pixels, size) * plan_.groups, pieces(), piece(),
-                        workers);
+    const Shares shares(conv_.batch * plan_.groups, pixels, 1, pieces(), piece(), workers);
     const int64_t in = kTile * plan_.channels, out = kTile * width_;
     Workspace memory(workers * (Workspace::need<T>(in) + Workspace::need<T>(out)));
     std::vector<Scratch> scratch;
     for (int i = 0; i < workers; ++i) scratch.push_back({memory.take<T>(in), memory.take<T>(out)});
     run_tasks(executor_, all * shares.count(), workers, [&](int worker, int64_t task) {
       const int64_t of_all = task / shares.count(), tile = of_all / plan_.groups;
-      const int64_t begin = tile % tiles * size;
-      const Part part{tile / tiles, of_all % plan_.groups, begin, std::min(size, pixels - begin),
+      const int64_t begin = tile % tiles * kTile;
+      const Part part{tile / tiles, of_all % plan_.groups, begin,
+                      std::min<int64_t>(kTile, pixels - begin),
                       outputs_of(shares.pieces(task % shares.count()))};
       planar_ ? planes(scratch[static_cast<size_t>(worker)], part)
               : rows(scratch[static_cast<size_t>(worker)], part);

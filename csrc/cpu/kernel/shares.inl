@@ -1,29 +1,42 @@
-// Tasks of tiles. Which share of its tile an output is in changes no result.
+// Tasks of tiles. Which tiles are multiplied at once, and which share of them an output is in,
+// changes no result.
 
-// How many tiles an image is worth: its last one may be next to nothing.
-SURFCONV_INLINE int64_t whole_tiles(int64_t pixels, int64_t tile) {
-  return std::max<int64_t>(1, (pixels + tile / 2) / tile);
-}
+SURFCONV_INLINE int64_t tiles_of(int64_t pixels) { return (pixels + kTile - 1) / kTile; }
 
-// The outputs of a tile cut into shares, which are tasks of their own, where there are too few
-// tiles to keep the workers busy: small maps of many channels. Each share gathers its tile again.
+// The tiles of each image cut into runs that are multiplied at once; and their outputs into shares,
+// which are tasks of their own, where there are too few tiles to keep the workers busy: small maps
+// of many channels. Each share gathers its tiles again.
 class Shares {
  public:
-  // pieces: what the outputs may be cut into, of so many channels each.
-  Shares(int64_t tiles, int64_t pieces, int64_t channels, int workers) : pieces_(pieces) {
-    constexpr int64_t kGather = 8;  // channels that cost what gathering does
-    int64_t least = std::numeric_limits<int64_t>::max();
-    for (int64_t count = 1; count <= pieces; ++count) {
-      const int64_t rounds = (tiles * count + workers - 1) / workers;
-      const int64_t cost = rounds * ((pieces + count - 1) / count * channels + kGather);
-      if (cost < least) least = cost, count_ = count;
+  // most: tiles that may be a run; pieces: what the outputs may be cut into, of so many channels.
+  Shares(int64_t images, int64_t pixels, int64_t most, int64_t pieces, int64_t channels,
+         int workers)
+      : pieces_(pieces) {
+    if (pixels == 0) return;
+    constexpr double kGather = 8;         // channels that cost a tile what gathering it does
+    constexpr double kStream = 1.0 / 16;  // of a tile's product, reading its weights once
+    const double tiles = static_cast<double>(pixels) / kTile;
+    double least = std::numeric_limits<double>::max();
+    for (int64_t run = 1; run <= most; ++run) {
+      const int64_t runs = (tiles_of(pixels) + run - 1) / run;
+      const double largest =
+          std::min(tiles, static_cast<double>((tiles_of(pixels) + runs - 1) / runs));
+      for (int64_t count = 1; count <= pieces; ++count) {
+        const double of_each = static_cast<double>((pieces + count - 1) / count * channels);
+        const double rounds = static_cast<double>((images * runs * count + workers - 1) / workers);
+        const double cost =
+            ((rounds - 1) * tiles / static_cast<double>(runs) + largest) * (of_each + kGather) +
+            rounds * of_each * kStream;
+        if (cost < least) least = cost, runs_ = runs, count_ = count;
+      }
     }
   }
+  int64_t runs() const { return runs_; }  // of an image
   int64_t count() const { return count_; }
   Range pieces(int64_t share) const {
     return {pieces_ * share / count_, pieces_ * (share + 1) / count_};
   }
 
  private:
-  int64_t pieces_, count_ = 1;
+  int64_t pieces_, runs_ = 0, count_ = 1;
 };

@@ -133,6 +133,10 @@ class Tile {
     }
   }
 
+  bool sees_all() const {
+    return seen_count_ == 1 && seen_[0].taps.count() == conv_.y.kernel * conv_.x.kernel;
+  }
+
   template <bool Writes, Slopes S>
   void fill_taps(int64_t first_tap, int64_t taps, int64_t unseen_read, int64_t unseen_write) {
     for (int64_t t = 0; t < taps; ++t) {

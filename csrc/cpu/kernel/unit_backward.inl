@@ -11,6 +11,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "prefetch.inl"
 #include "corners.inl"
 #include "tile.inl"
+#include "tiles.inl"
 #include "gemm.inl"
 #include "lanewise.inl"
 #include "blocks.inl"
@@ -27,7 +28,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "gradient_rows.inl"
 #include "output_gradient.inl"
 #include "pointwise_backward.inl"
-#include "backward_tile.inl"
+#include "backward_tiles.inl"
 #include "backward.inl"
 
 #if defined(SURFCONV_DOUBLE)

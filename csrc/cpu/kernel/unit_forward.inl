@@ -9,6 +9,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "axis.inl"
 #include "corners.inl"
 #include "tile.inl"
+#include "tiles.inl"
 #include "prefetch.inl"
 #include "gemm.inl"
 #include "lanewise.inl"

@@ -1,16 +1,17 @@
 // Backward. A task owns a run of channels (a unit) of one slot: nobody else writes its part of
 // grad_input, its partial grad_weight or its partial grad_scale; partials are summed in a fixed
-// order. For each tile: the gradient of the gathered matrix by one product, a pass that scatters
-// it, takes its dot product with the sample's slope and puts the gathered matrix in its place, and
-// the transposed product of that into grad_weight.
+// order. For each few tiles: the gradient of the gathered matrix by one product, a pass that
+// scatters it, takes its dot product with the sample's slope and puts the gathered matrix in its
+// place, and the transposed product of that into grad_weight.
 template <class T>
-class BackwardTile {
+class BackwardTiles {
  public:
   struct Scratch {
-    Tile<T> tile;
-    T* grad_out;  // [groups of the unit][kTile][width]
-    T* rows;      // [kTile][ld_rows]: gradient of the gathered matrix, then the matrix
-    T* dot;       // [2][kTile][lanes]
+    Tiles<T> tiles;
+    T* grad_out;  // [groups of the unit][most pixels][width]
+    T* rows;      // [most pixels][ld_rows]: gradient of the gathered matrix, then the matrix
+    T* copies;    // of both for their product
+    T* dot;       // [2][most pixels][lanes]
     T* discard;   // [row of the image]: what corners that are not seen write
   };
   // What a task adds to.
@@ -23,7 +24,7 @@ class BackwardTile {
     int64_t first_pixel, pixels;
   };
 
-  BackwardTile(const Conv& conv, const BackwardTensors& tensors)
+  BackwardTiles(const Conv& conv, const BackwardTensors& tensors, const Executor& executor)
       : conv_(conv),
         tensors_(tensors),
         plan_(conv),
@@ -38,10 +39,16 @@ class BackwardTile {
         ld_rows_(
             pad_width<T>(round_up(taps_ * std::min(kBlock, to_quads(plan_.channels)), kRowBlock)) +
             16),
+        most_tiles_(plan_.lanewise || taps_ < plan_.taps
+                        ? 1
+                        : Tiles<T>::at_once(conv, taps_, ld_rows_, executor.cache, kMostTiles)),
+        copies_(!plan_.lanewise && !swapped_ && worth_copying(width_)),
         needs_matrix_(tensors.grad_input.data != nullptr || tensors.grad_scale.data != nullptr),
         zeros_(static_cast<size_t>(std::max(plan_.row, ld_rows_) + 2 * kLanes<T>), T(0)) {}
 
   const Plan& plan() const { return plan_; }
+  // Of pixels that are handled at once.
+  int64_t most_pixels() const { return most_tiles_ * kTile; }
   const std::vector<Unit>& units() const { return units_; }
 
   // Elements of the partial grad_weight of a block: rows (tap, channel), padded.
@@ -92,24 +99,31 @@ class BackwardTile {
   }
 
   int64_t need() const {
-    return Tile<T>::need(conv_, taps_) + Workspace::need<T>(most_groups() * kTile * width_) +
-           Workspace::need<T>(kTile * ld_rows_) + Workspace::need<T>(2 * kTile * kLanes<T>) +
-           Workspace::need<T>(discarded());
+    return Tiles<T>::need(conv_, taps_, most_tiles_) +
+           Workspace::need<T>(most_groups() * most_pixels() * width_) +
+           Workspace::need<T>(most_pixels() * ld_rows_) + Workspace::need<T>(copied()) +
+           Workspace::need<T>(2 * most_pixels() * kLanes<T>) + Workspace::need<T>(discarded());
   }
   Scratch take(Workspace& memory) const {
-    return {Tile<T>(conv_, taps_, memory), memory.take<T>(most_groups() * kTile * width_),
-            memory.take<T>(kTile * ld_rows_), memory.take<T>(2 * kTile * kLanes<T>),
+    return {Tiles<T>(conv_, taps_, most_tiles_, memory),
+            memory.take<T>(most_groups() * most_pixels() * width_),
+            memory.take<T>(most_pixels() * ld_rows_),
+            memory.take<T>(copied()),
+            memory.take<T>(2 * most_pixels() * kLanes<T>),
             memory.take<T>(discarded())};
   }
 
   void run(Scratch& scratch, const Unit& unit, const Target& target, const GuideImage<T>& guide,
            int64_t n, int64_t begin, int count, const AxisSteps& steps_y,
            const AxisSteps& steps_x) const {
-    scratch.tile.place(tensors_.scale, guide, n, begin, count, steps_y, steps_x, true);
-    if (!plan_.lanewise) scratch.tile.find_seen(count, true);
-    const Gradients gradients = output_.read(unit, n, begin, count, scratch.grad_out);
+    Tiles<T>& tiles = scratch.tiles;
+    tiles.place(tensors_.scale, guide, n, begin, count, steps_y, steps_x, true);
+    if (!plan_.lanewise) tiles.find_seen(true);
+    const Gradients gradients =
+        output_.read(unit, n, begin, count, scratch.grad_out, most_pixels());
     if (target.bias != nullptr) output_.add_bias(gradients, unit, count, target.bias);
-    std::fill(scratch.dot, scratch.dot + 2 * kTile * kLanes<T>, T(0));
+    T* const dot_x = scratch.dot + most_pixels() * kLanes<T>;
+    std::fill(scratch.dot, scratch.dot + 2 * most_pixels() * kLanes<T>, T(0));
     const int64_t unseen_read = byte_distance(target.input, zeros_.data());
     const int64_t unseen_write = byte_distance(target.grad_input, scratch.discard);
     for (int64_t first_tap = 0; first_tap < plan_.taps; first_tap += taps_) {
@@ -117,28 +131,33 @@ class BackwardTile {
       with_needs(target, [&](auto writes, auto slopes) {
         constexpr bool Writes = decltype(writes)::value;
         constexpr Slopes S = decltype(slopes)::value;
-        if (scratch.tile.needs_list()) {
-          scratch.tile.template fill_taps<Writes, S>(first_tap, taps, unseen_read, unseen_write);
-        }
+        tiles.template fill_taps<Writes, S>(first_tap, taps, unseen_read, unseen_write);
         T* weight = target.weight;
         for (const ChannelBlock& block : unit.blocks) {
           const int64_t channel = block.group * to_quads(plan_.channels) + block.first;
           if (needs_matrix_)
             matrix_gradient(scratch, gradients, unit, block, first_tap, taps, count);
           const char* read = target.input + channel * static_cast<int64_t>(sizeof(T));
-          if constexpr (Writes || S != Slopes::none) {
-            char* write = nullptr;
-            if constexpr (Writes)
-              write = target.grad_input + channel * static_cast<int64_t>(sizeof(T));
-            const ScatterTarget<T> to{read,          write,
-                                      scratch.dot,   scratch.dot + kTile * kLanes<T>,
-                                      zeros_.data(), scratch.discard};
-            scatter_tile<Writes, S>(conv_, scratch.tile, first_tap, taps, to, block.padded,
-                                    scratch.rows, ld_rows_);
-          } else {
-            gather_tile(conv_, scratch.tile, first_tap, taps, read, block.padded, scratch.rows,
-                        ld_rows_, block.padded);
+          char* write = nullptr;
+          if constexpr (Writes) {
+            write = target.grad_input + channel * static_cast<int64_t>(sizeof(T));
           }
+          tiles.for_each([&](const Tile<T>& tile, int first, int) {
+            T* const rows = scratch.rows + first * ld_rows_;
+            if constexpr (Writes || S != Slopes::none) {
+              const ScatterTarget<T> to{read,
+                                        write,
+                                        scratch.dot + first * kLanes<T>,
+                                        dot_x + first * kLanes<T>,
+                                        zeros_.data(),
+                                        scratch.discard};
+              scatter_tile<Writes, S>(conv_, tile, first_tap, taps, to, block.padded, rows,
+                                      ld_rows_);
+            } else {
+              gather_tile(conv_, tile, first_tap, taps, read, block.padded, rows, ld_rows_,
+                          block.padded);
+            }
+          });
           if (weight != nullptr) {
             weight_gradient(scratch, gradients, block, first_tap, taps, count, weight);
             weight += weight_elements(block);
@@ -149,8 +168,8 @@ class BackwardTile {
     if (target.scale != nullptr) {
       for (int64_t k = 0; k < conv_.scale_components; ++k) {
         for (int m = 0; m < count; ++m) {
-          target.scale[k * target.pixels + begin - target.first_pixel + m] =
-              sum_lanes<T>(load<Vec<T, kLanes<T>>>(scratch.dot + (k * kTile + m) * kLanes<T>));
+          target.scale[k * target.pixels + begin - target.first_pixel + m] = sum_lanes<T>(
+              load<Vec<T, kLanes<T>>>(scratch.dot + (k * most_pixels() + m) * kLanes<T>));
         }
       }
     }
@@ -159,6 +178,11 @@ class BackwardTile {
  private:
   using Gradients = typename OutputGradient<T>::Part;
   static constexpr int kSwappedRows = 4;
+  // Only where all taps are gathered at a time: else how many there are would change the order in
+  // which the gradient of the input is added to. Copies of four leave the first-level cache.
+  static constexpr int64_t kMostTiles = 2;
+
+  int64_t copied() const { return copies_ ? copied_elements(most_pixels(), width_) : 0; }
 
   int64_t discarded() const { return conv_.x.in * plan_.row + kLanes<T>; }
 
@@ -211,7 +235,7 @@ class BackwardTile {
       const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
       const int64_t index = (&block - unit.blocks.data()) + block_index(unit);
       const T* weights = weights_.get() + (index * tap_blocks + first_tap / taps_) * stride_;
-      scratch.tile.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
+      scratch.tiles.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
         const GemmPart part{
             pixels, {0, plan_.outputs}, {seen.begin * block.padded, seen.end * block.padded}};
         gemm_packed<T>(part, taps * block.padded, plan_.outputs, from, ld, weights, scratch.rows,
@@ -244,14 +268,19 @@ class BackwardTile {
                                          weight + first_tap * block.padded, weight_row(block));
       } else {
         T* to = weight + first_tap * block.padded * width_;
-        scratch.tile.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
+        scratch.tiles.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
           const int64_t row = seen.begin * block.padded / kRowBlock * kRowBlock;
           const int64_t end = round_up(seen.end * block.padded, kRowBlock), m = pixels.begin;
           if (seen.count() == 0) return;
-          gemm_transposed<T, kRowBlock>(end - row, plan_.outputs,
-                                        std::min<int64_t>(pixels.end, count) - m,
-                                        scratch.rows + m * ld_rows_ + row, ld_rows_, from + m * ld,
-                                        ld, to + row * width_, width_);
+          const int64_t depth = std::min<int64_t>(pixels.end, count) - m;
+          const T* matrix = scratch.rows + m * ld_rows_ + row;
+          if (copies_) {
+            gemm_transposed_copied<T>(end - row, plan_.outputs, depth, matrix, ld_rows_,
+                                      from + m * ld, ld, to + row * width_, width_, scratch.copies);
+          } else {
+            gemm_transposed<T, kRowBlock>(end - row, plan_.outputs, depth, matrix, ld_rows_,
+                                          from + m * ld, ld, to + row * width_, width_);
+          }
         });
       }
       return;
@@ -282,6 +311,8 @@ class BackwardTile {
   const bool swapped_;
   const OutputGradient<T> output_;
   const int64_t width_, ld_rows_;
+  const int most_tiles_;  // at once
+  const bool copies_;
   const bool needs_matrix_;
   const std::vector<T> zeros_;
   Buffer<T> weights_;
