@@ -123,13 +123,22 @@ def test_same_bits_however_many_tiles_are_multiplied_at_once(
     problem.check_gradients(native)
 
 
+@pytest.mark.parametrize("batch", [1, 2])
 @pytest.mark.parametrize("guide", ["none", "holes"])
-@pytest.mark.parametrize("size", [(7, 7), (14, 14), (13, 30)])
+@pytest.mark.parametrize("size", [(7, 7), (14, 13), (13, 30)])
+@pytest.mark.parametrize("layout", ["contiguous", "channels_last"])
 @pytest.mark.parametrize("threads", [1, 3])
 def test_several_tiles_at_once(
-    native: NativeOperator, guide: str, size: tuple[int, int], threads: int
+    native: NativeOperator,
+    batch: int,
+    guide: str,
+    size: tuple[int, int],
+    layout: str,
+    threads: int,
 ) -> None:
-    problem = make_problem(2, 66, 40, size=size, kernel=5, padding=2, scale="random", guide=guide)
+    problem = make_problem(
+        batch, 66, 43, size=size, kernel=5, padding=2, guide=guide, layout=layout
+    )
     other = replace(native, threads=threads)
     problem.check_forward(other)
     problem.check_gradients(other)

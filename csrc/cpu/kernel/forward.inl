@@ -25,6 +25,8 @@ class Forward {
         most_tiles_(plan_.lanewise || few_
                         ? 1
                         : Tiles<T>::at_once(conv, taps_, ld_rows_, executor.cache, kMostTiles)),
+        packs_panels_(!plan_.lanewise && !few_ && plan_.groups == 1 && conv.batch == 1 &&
+                      conv.y.out * conv.x.out <= most_tiles_ * kTile),
         input_(conv, plan_, tensors.input),
         guide_(conv, tensors.guide),
         fused_(plan_.lanewise && plan_.mix == 1 && plan_.multiplier == 1),
@@ -32,8 +34,16 @@ class Forward {
                              : !plan_.lanewise && plan_.outputs == width_) &&
                      tensors.output.dtype == kComputeDType<T> && tensors.output.c == 1 &&
                      tensors.output.y == tensors.output.x * conv.x.out),
-        unseen_(static_cast<size_t>(plan_.row + kLanes<T>), T(0)) {
-    pack_weights();
+        unseen_(static_cast<size_t>(plan_.row + kLanes<T>), T(0)),
+        weights_(conv, plan_, width_) {
+    weights_.set_initial(tensors.bias);
+    if (plan_.lanewise) {
+      weights_.take(pack_lanewise<T, false>(conv, plan_, tensors.weight));
+    } else if (few_) {
+      weights_.take(pack_few<T>(few_, conv, plan_, tensors.weight));
+    } else if (!packs_panels_) {
+      weights_.pack(tensors.weight, blocks_, taps_, executor);
+    }
   }
 
   void run() {
@@ -45,10 +55,10 @@ class Forward {
         workers_for(executor_, conv_.batch * tiles_of(pixels) * pieces(),
                     conv_.batch * pixels * plan_.taps * plan_.channels * conv_.out_channels);
     const int64_t most_pixels = most_tiles_ * kTile;
-    const int64_t need = Tiles<T>::need(conv_, taps_, most_tiles_) +
-                         Workspace::need<T>(most_pixels * ld_rows_) +
-                         Workspace::need<T>(most_pixels * plan_.groups * width_) +
-                         (fused_ ? LaneScratch<T>::need(conv_) : 0);
+    const int64_t need =
+        Tiles<T>::need(conv_, taps_, most_tiles_) + Workspace::need<T>(most_pixels * ld_rows_) +
+        Workspace::need<T>(most_pixels * plan_.groups * width_) +
+        Workspace::need<T>(panel_elements()) + (fused_ ? LaneScratch<T>::need(conv_) : 0);
     Workspace memory(workers * need);
     std::vector<Scratch> scratch;
     scratch.reserve(static_cast<size_t>(workers));
@@ -56,6 +66,7 @@ class Forward {
       scratch.push_back({Tiles<T>(conv_, taps_, most_tiles_, memory),
                          memory.take<T>(most_pixels * ld_rows_),
                          memory.take<T>(most_pixels * plan_.groups * width_),
+                         memory.take<T>(panel_elements()),
                          {}});
       if (fused_) scratch.back().lanes.take(conv_, memory);
     }
@@ -69,16 +80,20 @@ class Forward {
  private:
   static constexpr int64_t kMostTiles = 4;  // more gained nothing, however large the weights
 
+  int64_t panel_elements() const { return packs_panels_ ? ld_rows_ * 2 * kLanes<T> : 0; }
+
   struct Scratch {
     Tiles<T> tiles;
-    T* rows;  // gathered matrix [pixels of the tiles][ld_rows]
-    T* out;   // [pixels of the tiles][groups * width]
+    T* rows;   // gathered matrix [pixels of the tiles][ld_rows]
+    T* out;    // [pixels of the tiles][groups * width]
+    T* panel;  // of weights, where a product packs its own
     LaneScratch<T> lanes;
   };
 
   void run_pass(const Pass& pass, std::vector<Scratch>& scratch, int workers) {
     const int64_t first = pass.out.begin * conv_.x.out, pixels = pass.out.count() * conv_.x.out;
-    const Shares shares(pass.images, pixels, most_tiles_, pieces(), piece(), workers);
+    const Shares shares(pass.images, pixels, most_tiles_, pieces(), piece(), workers,
+                        packs_panels_ ? 0.5 : 1.0 / 16);
     const int64_t tiles = tiles_of(pixels), runs = shares.runs();
     run_tasks(executor_, pass.images * runs * shares.count(), workers,
               [&](int worker, int64_t task) {
@@ -101,53 +116,6 @@ class Forward {
   Outputs outputs_of(Range pieces) const {
     if (plan_.lanewise || few_ || plan_.groups > 1) return {pieces, {0, plan_.outputs}};
     return {{0, 1}, {pieces.begin * piece(), std::min(pieces.end * piece(), plan_.outputs)}};
-  }
-
-  // Where the packed weights of a block of taps and channels start.
-  T* packed(const ChannelBlock& block, int64_t first_tap, int64_t taps) {
-    const int64_t depth = to_quads(plan_.channels);
-    return weights_.get() +
-           (block.group * plan_.taps * depth + first_tap * depth + taps * block.first) * width_;
-  }
-
-  void pack_weights() {
-    initial_.assign(static_cast<size_t>(plan_.groups * width_), T(0));
-    if (tensors_.bias.data != nullptr) {
-      visit_storage<T>(tensors_.bias, [&](auto* bias) {
-        const auto set = [&](int64_t o, int64_t place) {
-          initial_[static_cast<size_t>(place)] = widen(bias[o * tensors_.bias.c]);
-        };
-        if (plan_.lanewise) {
-          for_lane_weights<false>(conv_, plan_, [&](int64_t o, int64_t, int64_t k, int64_t lane) {
-            set(o, (plan_.mix == 1 ? k * plan_.row : 0) + lane);
-          });
-        } else {
-          for (int64_t o = 0; o < conv_.out_channels; ++o) {
-            set(o, o / plan_.outputs * width_ + o % plan_.outputs);
-          }
-        }
-      });
-    }
-    if (plan_.lanewise) {
-      weights_ = pack_lanewise<T, false>(conv_, plan_, tensors_.weight);
-      return;
-    }
-    if (few_) {
-      weights_ = pack_few<T>(few_, conv_, plan_, tensors_.weight);
-      return;
-    }
-    const int64_t depth = plan_.taps * plan_.row;
-    weights_ = Buffer<T>(depth * width_);
-    const int64_t tap_blocks = (plan_.taps + taps_ - 1) / taps_;
-    const int64_t tasks = tap_blocks * static_cast<int64_t>(blocks_.size());
-    run_tasks(executor_, tasks, workers_for(executor_, tasks, depth * width_),
-              [&](int, int64_t task) {
-                const ChannelBlock& block = blocks_[static_cast<size_t>(task / tap_blocks)];
-                const int64_t first_tap = task % tap_blocks * taps_;
-                const int64_t taps = std::min(taps_, plan_.taps - first_tap);
-                pack_forward(tensors_.weight, conv_.x.kernel, plan_, block, first_tap, taps,
-                             packed(block, first_tap, taps));
-              });
   }
 
   void multiply_tiles(Scratch& scratch, const Pass& pass, int64_t n, int64_t begin, int count,
@@ -178,18 +146,18 @@ class Forward {
     if (fused_) {
       fetch_ahead(only, count, 0, plan_.row);
       lane_forward(conv_, plan_, only, scratch.lanes, base, steps_y.read, steps_x.read,
-                   weights_.get(), initial_.data(), out, ld_out);
+                   weights_.data(), weights_.initial(), out, ld_out);
     }
     if (few_) {
       tiles.template fill_taps<false, Slopes::none>(0, plan_.taps, unseen, 0);
       few_forward(few_,
-                  FewTile<T>{conv_, only, base, weights_.get(), initial_.data(), out, ld_out});
+                  FewTile<T>{conv_, only, base, weights_.data(), weights_.initial(), out, ld_out});
     }
     const bool gathers = !few_ && (!fused_ || (only.guided() && only.has(Place::other)));
     if (plan_.lanewise && gathers) {
       for_gathered_runs(only, count, [&](const Run& run) {
         for (int m = run.begin; m < run.end; ++m) {
-          std::memcpy(out + m * ld_out, initial_.data(), static_cast<size_t>(width_ * bytes));
+          std::memcpy(out + m * ld_out, weights_.initial(), static_cast<size_t>(width_ * bytes));
         }
       });
     }
@@ -218,13 +186,25 @@ class Forward {
           multiply_lanes(scratch, block, first_tap, taps, count, out, ld_out);
         } else {
           const bool first = first_tap == 0 && block.first == 0;
-          const T* weights = packed(block, first_tap, taps);
           T* to = out + block.group * group_step;
-          const T* initial = first ? initial_.data() + block.group * width_ : nullptr;
-          tiles.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
-            const GemmPart part{pixels, {seen.begin * step, seen.end * step}, outputs.channels};
-            gemm_packed<T>(part, plan_.outputs, taps * step, scratch.rows, ld_rows_, weights, to,
-                           ld_out, initial);
+          const T* initial = first ? weights_.initial() + block.group * width_ : nullptr;
+          const auto multiply = [&](const T* weights, int64_t column, int64_t width,
+                                    Range columns) {
+            tiles.for_seen(first_tap, taps, [&](Range pixels, Range seen) {
+              const GemmPart part{pixels, {seen.begin * step, seen.end * step}, columns};
+              gemm_packed<T>(part, width, taps * step, scratch.rows, ld_rows_, weights, to + column,
+                             ld_out, first ? initial + column : nullptr);
+            });
+          };
+          if (!packs_panels_) {
+            multiply(weights_.of(block, first_tap, taps), 0, plan_.outputs, outputs.channels);
+            continue;
+          }
+          for_panels<T>(plan_.outputs, [&](int64_t column, int64_t columns) {
+            if (!outputs.channels.has(column)) return;
+            pack_panel(tensors_.weight, conv_.x.kernel, plan_, block, first_tap, taps, column,
+                       columns, scratch.panel);
+            multiply(scratch.panel, column, columns, {0, columns});
           });
         }
       }
@@ -268,7 +248,7 @@ class Forward {
       for_gathered_runs(scratch.tiles.front(), count, [&](const Run& run) {
         lane_multiply<decltype(mix)::value>(
             part, run.end - run.begin, scratch.rows + run.begin * ld_rows_, ld_rows_,
-            weights_.get(), out + run.begin * ld_out + block.first, ld_out, plan_.row);
+            weights_.data(), out + run.begin * ld_out + block.first, ld_out, plan_.row);
       });
     });
   }
@@ -282,13 +262,14 @@ class Forward {
   const Few few_;
   const int64_t width_, ld_rows_;
   const int most_tiles_;  // at once
+  // Weights that are used once are packed panel after panel, each into cache just before its use.
+  const bool packs_panels_;
   InputRows<T> input_;
   GuideRows<T> guide_;
   const bool fused_;  // lanewise without a gathered matrix, but where a guide hides corners
   const bool writes_rows_;
   std::vector<T> unseen_;  // what a corner outside the image reads
-  std::vector<T> initial_;
-  Buffer<T> weights_;
+  ForwardWeights<T> weights_;
 };
 
 template <class T>

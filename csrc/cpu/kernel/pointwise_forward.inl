@@ -19,7 +19,8 @@ class PointwiseForward {
     const int64_t tiles = tiles_of(pixels), all = conv_.batch * tiles * plan_.groups;
     const int workers = workers_for(executor_, all * pieces(),
                                     conv_.batch * pixels * plan_.channels * conv_.out_channels);
-    const Shares shares(conv_.batch * plan_.groups, pixels, 1, pieces(), piece(), workers);
+    const Shares shares(conv_.batch * plan_.groups, pixels, 1, pieces(), piece(), workers,
+                        1.0 / 16);
     const int64_t in = kTile * plan_.channels, out = kTile * width_;
     Workspace memory(workers * (Workspace::need<T>(in) + Workspace::need<T>(out)));
     std::vector<Scratch> scratch;

@@ -8,13 +8,13 @@ SURFCONV_INLINE int64_t tiles_of(int64_t pixels) { return (pixels + kTile - 1) /
 // of many channels. Each share gathers its tiles again.
 class Shares {
  public:
-  // most: tiles that may be a run; pieces: what the outputs may be cut into, of so many channels.
+  // most: tiles that may be a run; pieces: what the outputs may be cut into, of so many channels;
+  // weights: what having a run's costs, in products of a tile.
   Shares(int64_t images, int64_t pixels, int64_t most, int64_t pieces, int64_t channels,
-         int workers)
+         int workers, double weights)
       : pieces_(pieces) {
     if (pixels == 0) return;
-    constexpr double kGather = 8;         // channels that cost a tile what gathering it does
-    constexpr double kStream = 1.0 / 16;  // of a tile's product, reading its weights once
+    constexpr double kGather = 8;  // channels that cost a tile what gathering it does
     const double tiles = static_cast<double>(pixels) / kTile;
     double least = std::numeric_limits<double>::max();
     for (int64_t run = 1; run <= most; ++run) {
@@ -26,7 +26,7 @@ class Shares {
         const double rounds = static_cast<double>((images * runs * count + workers - 1) / workers);
         const double cost =
             ((rounds - 1) * tiles / static_cast<double>(runs) + largest) * (of_each + kGather) +
-            rounds * of_each * kStream;
+            rounds * of_each * weights;
         if (cost < least) least = cost, runs_ = runs, count_ = count;
       }
     }

@@ -24,6 +24,7 @@ namespace surfconv::cpu::SURFCONV_ISA {
 #include "shares.inl"
 #include "pointwise_pixels.inl"
 #include "pointwise_forward.inl"
+#include "forward_weights.inl"
 #include "forward.inl"
 
 }  // namespace surfconv::cpu::SURFCONV_ISA

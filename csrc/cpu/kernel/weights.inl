@@ -101,21 +101,29 @@ class WholeFilters {
   const bool are_;
 };
 
-// Rows (tap, channel) of a block against its group's outputs, in panels: the forward's B.
+// Rows (tap, channel) of a block against a panel of its group's outputs.
+template <class T>
+void pack_panel(const View& weight, int64_t kernel_x, const Plan& plan, const ChannelBlock& block,
+                int64_t first_tap, int64_t taps, int64_t column, int64_t columns, T* panel) {
+  const int64_t used = std::min(columns, plan.outputs - column);
+  const int64_t first = block.group * plan.outputs + column;
+  if (const WholeFilters<T> whole(weight, kernel_x, block, first_tap, taps); whole) {
+    return whole.load(first, used, panel, columns);
+  }
+  const auto load_run = [&](const WeightRun& run) {
+    load_pixels<T>(run.view, 0, first, used, run.width, run.first, run.count,
+                   panel + run.row * columns, run.step * columns, columns);
+  };
+  for_weight_runs(weight, kernel_x, block, first_tap, taps, block.count, load_run);
+}
+
+// All panels: the forward's B.
 template <class T>
 void pack_forward(const View& weight, int64_t kernel_x, const Plan& plan, const ChannelBlock& block,
                   int64_t first_tap, int64_t taps, T* packed) {
-  const WholeFilters<T> whole(weight, kernel_x, block, first_tap, taps);
   for_panels<T>(plan.outputs, [&](int64_t column, int64_t columns) {
-    T* panel = packed + column * taps * block.count;
-    const int64_t used = std::min(columns, plan.outputs - column);
-    const int64_t first = block.group * plan.outputs + column;
-    if (whole) return whole.load(first, used, panel, columns);
-    const auto load_run = [&](const WeightRun& run) {
-      load_pixels<T>(run.view, 0, first, used, run.width, run.first, run.count,
-                     panel + run.row * columns, run.step * columns, columns);
-    };
-    for_weight_runs(weight, kernel_x, block, first_tap, taps, block.count, load_run);
+    pack_panel(weight, kernel_x, plan, block, first_tap, taps, column, columns,
+               packed + column * taps * block.count);
   });
 }
 
