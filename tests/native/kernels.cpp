@@ -112,7 +112,8 @@ void forward(const std::string& name, const py::array& input, const py::array& w
 void backward(const std::string& name, const py::array& grad_output, const py::array& input,
               const py::array& weight, const py::array& scale, const Array& guide,
               const Array& grad_input, const Array& grad_weight, const Array& grad_bias,
-              const Array& grad_scale, const Arguments& arguments, int threads, bool in_turn, int64_t cache) {
+              const Array& grad_scale, const Arguments& arguments, int threads, bool in_turn,
+              int64_t cache) {
   const cpu::BackwardTensors tensors{
       view_of(grad_output, false), view_of(input, false),    view_of(weight, false),
       view_of(scale, false),       view_of(guide, false),    view_of(grad_input, true),
