@@ -179,7 +179,7 @@ class BackwardTiles {
   using Gradients = typename OutputGradient<T>::Part;
   static constexpr int kSwappedRows = 4;
   // Only where all taps are gathered at a time: else how many there are would change the order in
-  // which the gradient of the input is added to. Copies of four leave the first-level cache.
+  // which the gradient of the input is added to. Four were slower.
   static constexpr int64_t kMostTiles = 2;
 
   int64_t copied() const { return copies_ ? copied_elements(most_pixels(), width_) : 0; }
